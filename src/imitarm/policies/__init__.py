@@ -7,8 +7,11 @@ from imitarm.policies.acfra import ACFRA
 from imitarm.policies.adaptation import ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN, adapt
 from imitarm.policies.adapted_path import Adaptation
 from imitarm.policies.least_detour import PathAdapter
+from imitarm.policies.obstacle_cost import DistanceCost, GaussianCost, ObstacleCost
 from imitarm.policies.path_policy import PathPlan, PathPolicy
 from imitarm.policies.policy import Observation, Policy
+from imitarm.policies.primitive_path import PrimitivePath
+from imitarm.policies.rcamo import RCAMO
 from imitarm.policies.replanning import replan
 from imitarm.policies.stages import Stage, StagedPolicy
 from imitarm.registry import Registry
@@ -18,6 +21,7 @@ POLICIES: Registry[type[Policy]] = Registry(
     "imitarm.policies",
     {
         "acfra": "imitarm.policies.acfra:ACFRA",
+        "rcamo": "imitarm.policies.rcamo:RCAMO",
         "apf": "imitarm.policies.baselines.apf:APF",
         "dmp-steering": "imitarm.policies.baselines.dmp_steering:DMPSteering",
         "dmp-potential": "imitarm.policies.baselines.dmp_potential:DMPPotential",
@@ -40,12 +44,17 @@ __all__ = [
     "HORIZONTAL_ONLY",
     "NOT_DOWN",
     "POLICIES",
+    "RCAMO",
     "Adaptation",
+    "DistanceCost",
+    "GaussianCost",
     "Observation",
+    "ObstacleCost",
     "PathAdapter",
     "PathPlan",
     "PathPolicy",
     "Policy",
+    "PrimitivePath",
     "Stage",
     "StagedPolicy",
     "adapt",

@@ -27,6 +27,17 @@ Indices = NDArray[np.intp]
 
 KINDS = ("sphere", "box", "capsule", "cylinder", "cone", "ellipsoid", "convex_hull", "half_space")
 FAMILIES = (ROUNDS, SLABS, ELLIPSOIDS, CONES)
+_ROWS = (
+    "kinds",
+    "positions",
+    "quaternions",
+    "sizes",
+    "velocities",
+    "angular_velocities",
+    "covariances",
+    "stamps",
+    "track_ids",
+)
 _OF_THE_POSE = frozenset(("positions", "_frames", "_ahead", "_shapes"))
 
 
@@ -133,6 +144,11 @@ class PackedObstacles:
         for name in ("still", "rotating"):
             moved.__dict__.pop(name, None)
         return moved
+
+    def take(self, indices: Indices) -> PackedObstacles:
+        """Return some of the obstacles, those with ``indices`` (k,)."""
+        rows = {name: getattr(self, name)[indices] for name in _ROWS}
+        return PackedObstacles(**rows, polytopes=tuple(self.polytopes[i] for i in indices.tolist()))
 
     def _copy(self, **changes: object) -> PackedObstacles:
         """Return a copy with other poses; the copy shares the values that were computed for the shapes."""

@@ -225,12 +225,13 @@ class Scene:
             InputError: when the scene has no obstacle with this index.
         """
         i = whole_number(index, "name_of: index")
-        if not 0 <= i < len(self.obstacles):
-            raise InputError(f"obstacle {i} does not exist; the scene has {len(self.obstacles)}")
-        obstacle = self.obstacles[i]
+        obstacles = self.__dict__.get("_seen", self).obstacles  # shapes and names do not depend on the time
+        if not 0 <= i < len(obstacles):
+            raise InputError(f"obstacle {i} does not exist; the scene has {len(obstacles)}")
+        obstacle = obstacles[i]
         if obstacle.name:
             return f'{obstacle.kind} "{obstacle.name}"'
-        alike = sum(o.kind == obstacle.kind and not o.name for o in self.obstacles[: i + 1])
+        alike = sum(o.kind == obstacle.kind and not o.name for o in obstacles[: i + 1])
         return f"{obstacle.kind} {alike}"
 
     def check(self, tool_radius: float = 0.0) -> None:

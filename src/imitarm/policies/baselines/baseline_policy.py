@@ -61,22 +61,6 @@ class ToolGaps:
         return distance - self.radius, normal
 
 
-def allowed_axes(forbidden: Array) -> tuple[Array, Array]:
-    """Return the space in which a path may be displaced.
-
-    Args:
-        forbidden: directions in which the path must not be displaced, unit rows (m, 3).
-
-    Returns:
-        An orthonormal basis of the directions that are not forbidden both ways, as columns, shape (3, d), and the
-        remaining forbidden directions in this basis, shape (m', d).
-    """
-    both = np.any(forbidden @ forbidden.T < -1.0 + 1e-9, axis=1)
-    _, size, basis = np.linalg.svd(np.concatenate([np.zeros((1, 3)), forbidden[both]]))
-    axes = basis[np.count_nonzero(size > 1e-9) :].T
-    return axes, forbidden[~both] @ axes
-
-
 class BaselinePolicy(PathPolicy):
     """Base class of the baselines that plan the path of the tool, from the same learned path and the same gaps.
 

@@ -1,0 +1,128 @@
+"""PrimitivePath: the motion of a skill's primitive as tables over the phase, with the learned precision."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.kinematics.pose import Pose, quaternion_to_matrix
+from imitarm.skills.dmp import DMP
+from imitarm.skills.skill import Skill
+
+Array = NDArray[np.float64]
+
+N_SAMPLES = 600  # intervals of the tables
+_FLOOR = 5e-3  # [m] standard deviation that is added to the learned one
+
+
+@dataclass(frozen=True, eq=False)
+class PrimitivePath:
+    r"""The motion xi(s) of a primitive over the phase s, from 0 at the start to 1 at the goal.
+
+    The motion depends on the goal g linearly: if the goal moves by delta, the motion moves by ``p(s) delta``, with the
+    fraction p of the path that has been travelled. A moving goal therefore costs no new integration.
+
+    The precision is the inverse of the learned covariance, without its scale (thesis Eq 5.1, the matrix theta):
+
+    .. math:: \Theta(s) = \bar\sigma^2 (\Sigma(s) + \epsilon^2 I)^{-1}, \qquad \epsilon = 5\ mm
+
+    The factor makes the mean of ``trace(Theta) / 3`` over the path equal to 1.
+
+    Attributes:
+        duration: duration of the motion [s].
+        goal: tool_to_base at the end of the motion.
+        positions: xi at n + 1 equally spaced phases, shape (n + 1, 3) [m].
+        progress: p, shape (n + 1,).
+        precision: Theta, shape (n + 1, 3, 3).
+        quaternions: learned rotations wxyz, shape (n + 1, 4); None when no rotation was learned.
+    """
+
+    dmp: DMP
+    start: Pose | None
+    duration: float
+    goal: Pose
+    positions: Array
+    progress: Array
+    precision: Array
+    quaternions: Array | None
+
+    @classmethod
+    def of(cls, skill: Skill, dmp: DMP, start: Pose | None = None, goal: Pose | None = None) -> Self:
+        """Return the motion between two poses.
+
+        Args:
+            skill: the skill whose covariance is the tolerance.
+            dmp: primitive that was trained on the skill's nominal path.
+            start: pose of the tool at the start; None: as learned.
+            goal: pose of the tool at the end; None: as learned.
+        """
+        T = dmp.duration_
+        times = np.linspace(0.0, T, N_SAMPLES + 1)
+        motion = dmp.generate(start, goal, dt=T / N_SAMPLES)
+        covariance = skill.tolerance(times) + _FLOOR**2 * np.eye(3)
+        precision = np.asarray(np.linalg.inv(covariance), dtype=float)
+        precision *= 3.0 / float(np.trace(precision, axis1=1, axis2=2).mean())
+        return cls(
+            dmp,
+            start,
+            T,
+            skill.goal_ if goal is None else goal,
+            motion.positions,
+            dmp.progress(times),
+            precision,
+            motion.quaternions,
+        )
+
+    def to(self, goal: Pose) -> PrimitivePath:
+        """Return the motion to another goal."""
+        positions = self.positions + self.progress[:, None] * (goal.position - self.goal.position)
+        quaternions = self.quaternions
+        if quaternions is not None and not np.array_equal(goal.quaternion, self.goal.quaternion):
+            quaternions = self.dmp.generate(self.start, goal, dt=self.duration / N_SAMPLES).quaternions
+        return replace(self, goal=goal, positions=positions, quaternions=quaternions)
+
+    def position(self, phases: Array) -> Array:
+        """Return xi at phases (k,), shape (k, 3) [m]; a phase outside 0 to 1 counts as the nearest end."""
+        x = np.minimum(np.maximum(phases, 0.0), 1.0) * N_SAMPLES
+        i = np.minimum(x.astype(np.intp), N_SAMPLES - 1)
+        before = self.positions.take(i, axis=0)
+        return before + (x - i)[:, None] * (self.positions.take(i + 1, axis=0) - before)
+
+    def nearest(self, phases: Array) -> NDArray[np.intp]:
+        """Return the indices of the nearest samples, shape (k,)."""
+        return np.rint(np.minimum(np.maximum(phases, 0.0), 1.0) * N_SAMPLES).astype(np.intp)
+
+    def tangent(self, phase: float) -> Array:
+        """Return the direction of the motion (3,): that to the goal where the motion rests; 0 at the goal."""
+        i = min(int(phase * N_SAMPLES), N_SAMPLES - 1)
+        along = self.positions[i + 1] - self.positions[i]
+        length = float(np.sqrt(along.dot(along)))
+        if length * N_SAMPLES < _FLOOR:
+            along = self.goal.position - self.positions[i]
+            length = float(np.sqrt(along.dot(along)))
+        return along / length if length > 1e-9 else np.zeros(3)
+
+    def quaternion(self, phase: float) -> Array | None:
+        """Return the learned rotation wxyz (4,), or None when no rotation was learned."""
+        if self.quaternions is None:
+            return None
+        x = phase * N_SAMPLES
+        i = min(int(x), N_SAMPLES - 1)
+        before, after = self.quaternions[i], self.quaternions[i + 1]
+        between = before + (x - i) * (after if before.dot(after) >= 0.0 else -after) - (x - i) * before
+        return np.asarray(between / np.sqrt(between.dot(between)))
+
+    @cached_property
+    def speed(self) -> float:
+        """Highest speed of the motion [m/s]."""
+        steps = np.diff(self.positions, axis=0)
+        return float(np.sqrt(np.sum(steps * steps, axis=1).max())) * N_SAMPLES / self.duration
+
+    @cached_property
+    def rotations(self) -> Array | None:
+        """Learned rotations as matrices, shape (n + 1, 3, 3); None when no rotation was learned."""
+        return None if self.quaternions is None else quaternion_to_matrix(self.quaternions)

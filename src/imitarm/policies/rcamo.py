@@ -1,0 +1,362 @@
+"""RCAMO, real-time collision avoidance for moving obstacles (thesis Chapter 5): the push of least predicted cost."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.command import Command, Status
+from imitarm.errors import InputError
+from imitarm.kinematics.pose import (
+    Pose,
+    quaternion_conjugate,
+    quaternion_log,
+    quaternion_multiply,
+    quaternion_to_matrix,
+)
+from imitarm.policies.least_cost import Choice, LeastCost, Prediction, Response, allowed_axes, frame, headings
+from imitarm.policies.obstacle_cost import DistanceCost, GaussianCost, ObstacleCost, PredictedObstacles
+from imitarm.policies.policy import Observation, Policy
+from imitarm.policies.primitive_path import PrimitivePath
+from imitarm.scene.distances import distances
+from imitarm.skills.dmp import DMP
+from imitarm.skills.dynamical_systems import Gains
+from imitarm.skills.skill import Skill
+from imitarm.validation import choice, finite_array, finite_number, instance, whole_number
+
+Array = NDArray[np.float64]
+
+_SAME_PLACE = 5e-3  # [m, rad] a start nearer than this to the learned one is the learned one
+_NO_INFLUENCE = 0.3  # [m] beyond the clearance: an obstacle that stays farther away has no effect
+_RATE_TIME = 0.1  # [s] in which the phase takes up another speed
+_STANDS = 0.1  # speed of the phase below which the motion is said to wait
+_DISPLACED = 1e-3  # [m] from the learned path: less is not called avoiding
+_FASTEST_TURN = 1.0  # [rad/s] by which an error of the tool's rotation is corrected
+
+
+class Margin(Protocol):
+    """An additional distance that grows with the look-ahead time, such as ``imitarm.perception.CoverageMargin``."""
+
+    def at(self, tau: Any) -> Any:
+        """Return the margin [m] for look-ahead times ``tau`` [s]."""
+
+
+class _Near(NamedTuple):
+    """The obstacles that may come near, predicted, and their indices in the scene."""
+
+    obstacles: PredictedObstacles
+    indices: NDArray[np.intp]
+
+
+class RCAMO(Policy):
+    r"""Follow the primitive of a skill, and evade moving obstacles in the direction of least predicted cost.
+
+    The primitive (GMM, GMR, then DMP) gives the motion ``xi(s)`` for a scene without obstacles. The tool's deviation
+    ``e = x - xi(s)`` obeys the primitive's own spring and damper, with a coupling acceleration ``u``:
+
+    .. math:: \tau^2 \ddot e + D \tau \dot e + K e = \tau^2 u, \qquad \dot s = r / T
+
+    In every step, all candidates for ``u`` and for the speed ``r`` of the phase are rolled out over a horizon, with the
+    obstacles predicted at the velocities that the scene reports, and the candidate of least cost is taken (thesis Eq
+    5.5, corrected; see :class:`~imitarm.policies.least_cost.LeastCost`). To wait and to go back are candidates too.
+    Without an obstacle near, ``u = 0``, and the spring brings the tool back to its path.
+
+    The policy keeps the tool clear. The links are kept clear by the :class:`~imitarm.safety.SafetyFilter`. The policy
+    decides step by step, so it can't promise to arrive, and does not refuse.
+
+    Args:
+        skill: skill to reproduce.
+        cost: ``"distance"``: by the signed distance, for any shape; ``"gaussian"``: as in the thesis (see
+            :mod:`~imitarm.policies.obstacle_cost`).
+        gains: ``"critical"``, ``"thesis"`` (K = 139.26, D = 28) or Gains, for the primitive and the deviation.
+        margin: additional distance that grows with the look-ahead time, such as a
+            :class:`~imitarm.perception.CoverageMargin`. None: ``min(beta sigma, cap)``, where sigma is the largest
+            standard deviation of an obstacle's observed position.
+        beta: see ``margin``.
+        cap: see ``margin`` [m].
+        time_constant: tau of the deviation [s]; the thesis has 1.
+        max_acceleration: largest u [m/s^2]. The largest lasting deviation is ``tau^2 u / K``.
+        horizon: number H of predicted instants.
+        interval: time between them [s].
+        gain: feedback of the tool's position and rotation [1/s].
+        patience: e_0, the lag at which the phase stops [m].
+        arrival: the motion has arrived when the tool is nearer than this to the goal [m].
+        options: arguments of :class:`~imitarm.policies.Policy`.
+    """
+
+    def __init__(
+        self,
+        skill: Skill,
+        *,
+        cost: Literal["distance", "gaussian"] = "distance",
+        gains: str | Gains = "critical",
+        margin: Margin | None = None,
+        beta: float = 1.0,
+        cap: float = 0.01,
+        time_constant: float = 1.0,
+        max_acceleration: float = 20.0,
+        horizon: int = 12,
+        interval: float = 0.05,
+        gain: float = 8.0,
+        patience: float = 0.02,
+        arrival: float = 0.003,
+        **options: Any,
+    ) -> None:
+        super().__init__(skill, **options)
+        choice(cost, ("distance", "gaussian"), "RCAMO: cost")
+        self.gains = Gains.of(gains, "RCAMO")
+        self._margin = margin
+        self._beta = finite_number(beta, "RCAMO: beta", at_least=0.0)
+        self._cap = finite_number(cap, "RCAMO: cap", "m", at_least=0.0)
+        self._tau = finite_number(time_constant, "RCAMO: time_constant", "s", above=0.0)
+        self._gain = finite_number(gain, "RCAMO: gain", "1/s", above=0.0)
+        self._patience = finite_number(patience, "RCAMO: patience", "m", above=0.0)
+        self._arrival = finite_number(arrival, "RCAMO: arrival", "m", above=0.0)
+        steps = whole_number(horizon, "RCAMO: horizon", at_least=1, at_most=200)
+        self._times = finite_number(interval, "RCAMO: interval", "s", above=0.0) * np.arange(1.0, steps + 1.0)
+        self.least_cost = LeastCost(
+            Response.of(self.gains, self._tau, self._times),
+            finite_number(max_acceleration, "RCAMO: max_acceleration", "m/s^2", above=0.0),
+        )
+        spheres = np.zeros((1, 4)) if self.tool_spheres is None else self.tool_spheres
+        self._spheres = spheres[:, :3]
+        self._tool_radius = float(np.max(np.linalg.norm(spheres[:, :3], axis=1) + spheres[:, 3]))
+        self.obstacle_cost = self._cost(cost, spheres[:, 3])
+        forbidden = finite_array(np.reshape(np.asarray(self.forbidden, dtype=float), (-1, 3)), (None, 3), "forbidden")
+        self._axes, rest = allowed_axes(forbidden / np.linalg.norm(forbidden, axis=1, keepdims=True))
+        self._one_sided = rest @ self._axes.T
+        self._headings = headings(self._axes)
+        self._dmp = _primitive(skill, self.gains)
+        self._steps: dict[float, Response] = {}
+        self._path: PrimitivePath | None = None
+
+    def _cost(self, name: str, radii: Array) -> ObstacleCost:
+        if name == "distance":
+            return DistanceCost(self.clearance, radii)
+        return GaussianCost(self.clearance, radii, stiffness=self.least_cost.deviation_weight)
+
+    # ----- start
+
+    def reset(self, observation: Observation) -> None:
+        """Start the motion at the measured pose of the tool."""
+        away = observation.tool_to_base.error_to(self.skill.start_)
+        if not self.skill.gmr_.has_orientation_:
+            away = away[:3]
+        start = None if np.linalg.norm(away) <= _SAME_PLACE else observation.tool_to_base
+        self._path = PrimitivePath.of(self.skill, self._dmp, start, observation.scene.goal)
+        self._begin(observation, 0.0)
+
+    def resume(self, observation: Observation, phase: float) -> None:
+        """Go on from the measured pose of the tool, at a fraction ``phase`` of the motion, 0 to 1.
+
+        The motion is that of the last :meth:`reset`; without one, it is that from the learned start.
+        """
+        phase = finite_number(phase, "RCAMO.resume: phase", at_least=0.0, at_most=1.0)
+        instance(observation, Observation, "RCAMO.resume: observation")
+        if self._path is None:
+            self._path = PrimitivePath.of(self.skill, self._dmp, None, observation.scene.goal)
+        self._begin(observation, phase)
+
+    def _begin(self, observation: Observation, phase: float) -> None:
+        path = self._followed(observation)
+        self._phase, self._rate = phase, 1.0
+        self._deviation = np.zeros((2, 3))
+        self._deviation[0] = observation.tool_to_base.position - path.position(np.array([phase]))[0]
+        self._scaled = np.zeros(3)
+        self._hold = observation.tool_to_base.quaternion
+        self._reason = ""
+
+    @property
+    def phase(self) -> float:
+        """Completed fraction of the motion, 0 to 1."""
+        return self._phase
+
+    def _followed(self, observation: Observation) -> PrimitivePath:
+        """Return the motion to the goal of the scene; if the goal has moved, the tool keeps its place."""
+        path = self._path
+        if path is None:
+            raise InputError("RCAMO.step: call reset(observation) or resume(observation, phase) first")
+        goal = self.skill.goal_ if observation.scene.goal is None else observation.scene.goal
+        if goal is path.goal:
+            return path
+        if not (
+            np.array_equal(goal.position, path.goal.position) and np.array_equal(goal.quaternion, path.goal.quaternion)
+        ):
+            here = np.array([self._phase])
+            moved = path.to(goal)
+            self._deviation[0] -= (moved.position(here) - path.position(here))[0]
+            path = self._path = moved
+        return path
+
+    # ----- each step
+
+    def step(self, observation: Observation, dt: float) -> Command:
+        """Return the command of least predicted cost.
+
+        Raises:
+            InputError: when neither ``reset`` nor ``resume`` was called.
+        """
+        path = self._followed(observation)
+        x = observation.tool_to_base.position
+        reference = path.position(np.array([self._phase]))[0] + self._deviation[0]
+        lag = x - reference
+        away = float(np.sqrt(lag.dot(lag)))
+        if away > self._patience:
+            shift = lag * (1.0 - self._patience / away)
+            self._deviation[0] += shift
+            reference, lag, away = reference + shift, lag - shift, self._patience
+        near = self._near(observation, path)
+        chosen = self._choose(path, lag, near)
+        rate = chosen.rate * max(0.0, 1.0 - (away / self._patience) ** 2)
+        phase = self._advance(rate, chosen.push, dt)
+        moved = path.position(np.array([self._phase]))[0] + self._deviation[0]
+        twist = np.empty(6)
+        twist[:3] = (moved - reference) / dt - self._gain * lag
+        twist[3:] = self._rotation(path, observation.tool_to_base, phase, dt)
+        return self._command(twist, observation, near, chosen, away)
+
+    def _advance(self, rate: float, push: Array, dt: float) -> float:
+        """Advance phase and deviation by ``dt``; return the phase before."""
+        one = self._steps.get(dt)
+        if one is None:
+            one = self._steps[dt] = Response.of(self.gains, self._tau, np.array([dt]))
+        before = self._phase
+        self._phase = float(self._phases(rate, np.array([dt]))[0])
+        self._phase = min(max(self._phase, 0.0), 1.0)
+        self._rate = rate + (self._rate - rate) * math.exp(-dt / _RATE_TIME)
+        e, v = self._deviation
+        self._deviation = np.stack(
+            [one.A * e + one.B * v + one.G * push, one.a_rate * e + one.b_rate * v + one.g_rate * push]
+        )
+        return before
+
+    def _phases(self, rate: float, times: Array) -> Array:
+        """Return the phases at ``times`` (k,) [s] from now, when the phase takes up the speed ``rate``."""
+        transient = (self._rate - rate) * _RATE_TIME * (1.0 - np.exp(times / -_RATE_TIME))
+        return np.asarray(self._phase + (rate * times + transient) / self._dmp.duration_)
+
+    def _choose(self, path: PrimitivePath, lag: Array, near: _Near | None) -> Choice:
+        if near is None:
+            self._scaled = np.zeros(3)
+            return Choice(np.zeros(3), 1.0, 0.0, None)
+        axes = frame(path.tangent(self._phase), self._axes)
+        directions = self._headings @ axes.T
+        if len(self._one_sided):
+            directions = directions[(directions @ self._one_sided.T <= 1e-9).all(axis=1)]
+        measured = self._deviation.copy()
+        measured[0] += lag
+        free = self.least_cost.response.free(measured)
+
+        def predict(rate: float) -> Prediction:
+            phases = self._phases(rate, self._times)
+            samples = path.nearest(phases)
+            centers = path.position(phases) + free
+            return Prediction(centers[:, None] + self._offsets(path, samples), free, path.precision[samples])
+
+        def cost(points: Array) -> tuple[Array, Array]:
+            return self.obstacle_cost.values(near.obstacles, points)
+
+        scaled = self.least_cost.candidates(directions)
+        chosen = self.least_cost.choose(scaled, self._scaled, predict, cost)
+        self._scaled = chosen.push / self.least_cost.max_acceleration
+        return chosen
+
+    def _offsets(self, path: PrimitivePath, samples: NDArray[np.intp]) -> Array:
+        """Return the centres of the tool's spheres relative to its tip, shape (H, S, 3) [m]."""
+        if path.rotations is None:
+            return (self._spheres @ quaternion_to_matrix(self._hold).T)[None]
+        return np.matmul(path.rotations[samples], self._spheres.T).transpose(0, 2, 1)
+
+    def _near(self, observation: Observation, path: PrimitivePath) -> _Near | None:
+        """Return the obstacles that may have an effect within the horizon; None if there is none."""
+        scene = observation.scene
+        packed = scene.packed
+        if not len(packed):
+            return None
+        elapsed, span = observation.time - scene.stamp, float(self._times[-1])
+        x = observation.tool_to_base.position
+        offset = packed.positions + elapsed * packed.velocities - x
+        gap = np.sqrt(np.sum(offset * offset, axis=1)) - packed.radii
+        unbounded = np.isinf(packed.radii)
+        if unbounded.any():
+            gap = np.where(unbounded, distances(packed, x[None, None], [elapsed])[:, 0, 0], gap)
+        speed = np.sqrt(np.sum(packed.velocities * packed.velocities, axis=1))
+        margin = self._margins(packed.covariances, elapsed)
+        reach = self._tool_radius + self.clearance + _NO_INFLUENCE + self._travel(path) + margin.max(axis=1)
+        indices = (gap - span * speed <= reach).nonzero()[0]
+        if not len(indices):
+            return None
+        if len(indices) < len(packed):
+            packed, margin = packed.take(indices), margin[indices]
+        return _Near(PredictedObstacles(packed, elapsed + self._times, margin), indices)
+
+    def _travel(self, path: PrimitivePath) -> float:
+        """Return a bound of the tool's travel within the horizon [m]."""
+        response, (e, v) = self.least_cost.response, self._deviation
+        own = np.abs(response.A - 1.0).max() * np.sqrt(e.dot(e)) + np.abs(response.B).max() * np.sqrt(v.dot(v))
+        return float(own + response.G.max() * self.least_cost.max_acceleration + path.speed * self._times[-1])
+
+    def _margins(self, covariances: Array, elapsed: float) -> Array:
+        """Return the additional distance to each of n obstacles at each instant, shape (n, H) [m]."""
+        n = len(covariances)
+        if self._margin is not None:
+            grown = np.asarray(self._margin.at(elapsed + self._times), dtype=float)
+            return np.broadcast_to(grown, (n, len(self._times)))
+        if not covariances.any():
+            return np.zeros((n, len(self._times)))
+        sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[:, -1], 0.0))
+        return np.broadcast_to(np.minimum(self._beta * sigma, self._cap)[:, None], (n, len(self._times)))
+
+    def _rotation(self, path: PrimitivePath, tool: Pose, phase: float, dt: float) -> Array:
+        """Return the angular velocity that follows the learned rotation, shape (3,) [rad/s]."""
+        before, after = path.quaternion(phase), path.quaternion(self._phase)
+        forward = np.zeros(3)
+        if before is None or after is None:
+            before = self._hold
+        else:
+            forward = quaternion_log(quaternion_multiply(after, quaternion_conjugate(before))) / dt
+        error = self._gain * tool.error_to(Pose.trusted(tool.position, before))[3:]
+        size = float(np.sqrt(error.dot(error)))
+        return forward + (error * (_FASTEST_TURN / size) if size > _FASTEST_TURN else error)
+
+    def _command(
+        self, twist: Array, observation: Observation, near: _Near | None, chosen: Choice, lag: float
+    ) -> Command:
+        if near is not None and chosen.nearest is not None:
+            index, gap = chosen.nearest
+            name = observation.scene.name_of(near.indices[index])
+            self._reason = f"{name}, predicted to come within {1e3 * gap:.0f} mm of the tool"
+        deviation = float(np.sqrt(self._deviation[0].dot(self._deviation[0])))
+        waits = self._rate < _STANDS and self._phase < 1.0
+        if waits and chosen.rate < _STANDS:
+            reason = f"the motion waits because of {self._reason}"
+            return Command(twist, progress=self._phase, status=Status.WAITING, reason=reason)
+        if waits or (self._phase >= 1.0 and lag >= 0.5 * self._patience):
+            reason = f"the tool is {1e3 * lag:.0f} mm behind its motion"
+            return Command(twist, progress=self._phase, status=Status.WAITING, reason=reason)
+        if self._phase >= 1.0 and deviation > self._arrival and chosen.push.any():
+            reason = f"the goal is not free because of {self._reason}"
+            return Command(twist, progress=self._phase, status=Status.WAITING, reason=reason)
+        if self._reason and (deviation > _DISPLACED or chosen.rate < 1.0):
+            reason = f"the tool is {1e3 * deviation:.0f} mm from its path because of {self._reason}"
+            return Command(twist, progress=self._phase, status=Status.AVOIDING, reason=reason)
+        return Command(twist, progress=self._phase)
+
+    def finished(self, observation: Observation) -> bool:
+        """Return whether the phase is at its end, and the tool is nearer than ``arrival`` to the goal."""
+        if self._path is None:
+            return False
+        goal = self.skill.goal_ if observation.scene.goal is None else observation.scene.goal
+        away = observation.tool_to_base.position - goal.position
+        return self._phase >= 1.0 and float(np.sqrt(away.dot(away))) < self._arrival
+
+
+def _primitive(skill: Skill, gains: Gains) -> DMP:
+    """Return the skill's primitive, or one with other gains that is trained on the same nominal path."""
+    if skill.dmp_.gains_ == gains:
+        return skill.dmp_
+    n = skill.dmp_.n_basis
+    return DMP(gains, n_basis=n).fit(skill.gmr_.trajectory(max(400, 5 * n)), exact_ends=True)
