@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import Pose
 from imitarm.perception.association import NO_PAIRS, Pairs, assign, duplicates
+from imitarm.perception.consistency import Consistency, chi_square_quantile
 from imitarm.perception.detection import Detection
 from imitarm.perception.motion_filter import Measurements, MotionFilter
 from imitarm.perception.tracks import UNCONFIRMED, TrackedObstacle, Tracks
@@ -24,6 +25,7 @@ Indices = NDArray[np.intp]
 
 _FLOOR = 1e-18  # [m^2] smallest variance of a detection: two exact ones at the same time stay solvable
 _RESET = 10.0  # [s] a stamp that goes back by more was given by another clock
+_RECENT = 300  # updates whose innovations are kept
 _FULL_COUNT = 10  # detections after which a size is smoothed with a fixed weight
 
 
@@ -63,6 +65,9 @@ class ObstacleTracker:
     track. If there are more than ``max_obstacles`` tracks, those that were not seen for longest are removed
     (``"removed"``); more detections than ``max_obstacles`` in one update are an error, and nothing changes.
 
+    **Consistency.** :attr:`consistency` compares the innovations with their covariance. If the mean is above
+    its band, the detections are noisier than their covariance says, or ``process_noise`` is too small.
+
     Rotations are not estimated: a track has the rotation of its last detection and no angular velocity. Sizes are
     averaged over the detections.
 
@@ -97,14 +102,12 @@ class ObstacleTracker:
         initial_speed: float = 0.5,
         history: float = 0.5,
     ) -> None:
-        from scipy.special import gammaincinv  # noqa: PLC0415  slow to import
-
         self.motion = motion
         self.filter = MotionFilter(motion, process_noise, initial_speed)
         probability = finite_number(gate, "ObstacleTracker: gate", above=0.0)
         if probability >= 1.0:
             raise InputError(f"ObstacleTracker: gate must be a probability below 1, got {gate:g}")
-        self.gate = 2.0 * float(gammaincinv(1.5, probability))  # quantile of chi-square, 3 degrees of freedom
+        self.gate = chi_square_quantile(probability, 3)
         self.confirm = _checked_confirm(confirm)
         self.max_unseen = finite_number(max_unseen, "ObstacleTracker: max_unseen", "s", above=0.0)
         self.max_speed = finite_number(max_speed, "ObstacleTracker: max_speed", "m/s", above=0.0)
@@ -116,6 +119,8 @@ class ObstacleTracker:
         """Forget all tracks and counts; track numbers start from 0 again."""
         self.ignored: Counter[str] = Counter()
         self._steps: deque[_Step] = deque()
+        self._distances: deque[Array] = deque(maxlen=_RECENT)
+        self._forgotten = False  # whether steps are no longer kept
         self._scene: Scene | None = None
 
     @property
@@ -127,6 +132,12 @@ class ObstacleTracker:
     def tracks(self) -> tuple[TrackedObstacle, ...]:
         """The confirmed tracks at :attr:`stamp`, in the order of their numbers."""
         return self._steps[-1].tracks.view if self._steps else ()
+
+    @property
+    def consistency(self) -> Consistency:
+        """Mean normalised innovation squared (NIS) of the last 300 updates, and its 95 % band for a correct filter."""
+        values = np.concatenate(list(self._distances)) if self._distances else np.empty(0)
+        return Consistency.of(values, gate=self.gate)
 
     def update(self, stamp: float, detections: Sequence[Detection]) -> tuple[TrackedObstacle, ...]:
         """Take in what one sensor measured at one time.
@@ -208,9 +219,11 @@ class ObstacleTracker:
         """Take in an update that is not older than any other."""
         before = self._steps[-1].tracks if self._steps else Tracks.none(self.filter, stamp)
         self._steps.append(self._advanced(before, stamp, detections))
+        self._distances.append(self._steps[-1].distances)
         self._scene = None
         while len(self._steps) > 1 and self._steps[1].stamp <= stamp - self.history:
             self._steps.popleft()
+            self._forgotten = True
 
     def _insert(self, stamp: float, detections: tuple[Detection, ...]) -> None:
         """Take in a late update: go back to its time, and repeat the later ones."""
@@ -220,15 +233,16 @@ class ObstacleTracker:
                 f"ObstacleTracker.update: stamp {stamp:.3f} s is {newest - stamp:.1f} s before the newest one "
                 f"({newest:.3f} s); all sensors must use one clock. Call reset() after the clock was set back"
             )
-        if stamp < max(oldest, newest - self.history):
+        if stamp < newest - self.history or (stamp < oldest and self._forgotten):
             self.ignored["late"] += 1
             return
         if self._repeats(stamp, detections):
             self.ignored["repeated"] += 1
             return
         later = []
-        while self._steps[-1].stamp > stamp:
+        while self._steps and self._steps[-1].stamp > stamp:
             later.append(self._steps.pop())
+            self._distances.pop()
         self._append(stamp, detections)
         for step in reversed(later):
             self._append(step.stamp, step.detections)
