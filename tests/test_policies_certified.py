@@ -277,7 +277,8 @@ def clearance_of(obstacles, polyline, *, radius=0.0, offset=None, bow=0.0):
     n = len(polyline)
     offsets = tuple(None if offset is None else offset[None] for _ in obstacles)
     spheres = np.array([[0.0, 0.0, 0.0, radius]])
-    tool = ToolAmongObstacles(tuple(obstacles), spheres, spheres[:, 3], offsets, np.full((1, n - 1), bow))
+    bows, none = np.full((1, n - 1), bow), (None,) * len(obstacles)
+    tool = ToolAmongObstacles(tuple(obstacles), spheres, spheres[:, 3], offsets, bows, np.arange(float(n)), none)
     return tool.clearance_of(polyline)
 
 

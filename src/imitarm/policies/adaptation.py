@@ -27,6 +27,7 @@ from imitarm.policies.least_detour import (
     LeastDetour,
     PathAdapter,
 )
+from imitarm.policies.prediction_margin import Margin, PredictionMargin, margins_in
 from imitarm.policies.whole_arm import ArmSolution, ArmTask, solve
 from imitarm.registry import Registry
 from imitarm.scene.scene import Scene
@@ -80,6 +81,8 @@ def adapt(
     max_tilt: float | None = None,
     goal_tilt: float = 0.0,
     allowance: float = 0.0,
+    margin: Margin | None = None,
+    margin_horizon: float | None = None,
 ) -> Adaptation:
     """Adapt the whole path of a skill to the obstacles of a scene.
 
@@ -118,6 +121,10 @@ def adapt(
             if the arm, with the learned rotation, does not keep the clearance at the goal.
         allowance: additional clearance for the tracking errors of the robot, used if a path with this larger clearance
             is found [m].
+        margin: bound of the error with which obstacles are predicted, a ``CoverageMargin``. At time t, the distance to
+            an obstacle that a tracker estimates, or that moves, is then at least ``clearance + margin.at(t)``. The time
+            t counts from when the obstacle was seen. None: predictions are exact.
+        margin_horizon: time since an obstacle was seen after which its margin does not grow [s]; None: it always grows.
 
     Returns:
         The adaptation; check ``feasible`` before executing it.
@@ -149,15 +156,17 @@ def adapt(
     at_goal = finite_number(goal_tilt, "goal_tilt", "rad", at_least=0.0)
     limit = tilt_limits(path, max_tilt, at_goal)
     allowed = allowed_directions(forbidden)
-    tool = ToolAmongObstacles.along(path.nominal, _spheres(path, tool_radius, tool_spheres, arm), scene.obstacles)
+    margins = margins_in(scene, margin, margin_horizon)
+    spheres = _spheres(path, tool_radius, tool_spheres, arm)
+    tool = ToolAmongObstacles.along(path.nominal, spheres, scene.obstacles, margins)
     nominal = tool.clearance_of(path.nominal.positions)
     for more in dict.fromkeys((extra, 0.0)):
         problem = AvoidanceProblem(path, nominal, clearance + more, allowed)
         adaptation, detour = _of_tool(problem, scene, method, adapter, began)
         if arm is not None and posture is not None and adapter.refuses and not _covered(problem, at_goal):
-            task = ArmTask(arm, posture, scene, problem.clearance, allowed, limit, at_goal, more)
+            task = ArmTask(arm, posture, scene, problem.clearance, allowed, limit, at_goal, more, margins=margins)
             adaptation = of_whole_arm(
-                adaptation, solve(task, detour.path, detour.displacement), scene, problem.clearance, began
+                adaptation, solve(task, detour.path, detour.displacement), scene, problem.clearance, began, margins
             )
         if adaptation.feasible:
             break
@@ -214,8 +223,8 @@ def _of_tool(
         tolerance=path.tolerance,
         min_clearance=detour.clearance.lowest,
         certified_clearance=detour.lowest,
-        only_on_schedule=any(obstacle.velocity.any() for obstacle in scene.obstacles),
-        validity=_validity(scene, path.nominal.duration),
+        only_on_schedule=depends_on_time(scene, tool.margins),
+        validity=_validity(scene, path.nominal.duration, tool.margins),
         deviation=used.deviation(detour.displacement),
         jerk_ratio=jerk_ratio,
         jerk_reason=_jerk_reason(scene, detour, jerk_ratio, clearance),
@@ -257,7 +266,20 @@ def _first_posture(arm: ArmModel, nominal: Trajectory, state: ArmState | None) -
     return find_posture(arm, Pose(nominal.positions[0], rotation))
 
 
-def of_whole_arm(tool: Adaptation, solution: ArmSolution, scene: Scene, clearance: float, began: float) -> Adaptation:
+def depends_on_time(scene: Scene, margins: Sequence[PredictionMargin | None]) -> bool:
+    """Return whether a guarantee depends on the schedule: because an obstacle moves, or because a margin grows."""
+    growing = any(margin is not None and margin.growth > 0.0 for margin in margins)
+    return growing or any(obstacle.velocity.any() for obstacle in scene.obstacles)
+
+
+def of_whole_arm(
+    tool: Adaptation,
+    solution: ArmSolution,
+    scene: Scene,
+    clearance: float,
+    began: float,
+    margins: Sequence[PredictionMargin | None],
+) -> Adaptation:
     """Return the adaptation of the whole arm, given the adaptation of the tool alone, or of a motion that has begun.
 
     Args:
@@ -266,6 +288,7 @@ def of_whole_arm(tool: Adaptation, solution: ArmSolution, scene: Scene, clearanc
         scene: the obstacles.
         clearance: required [m].
         began: when the computation began, by ``time.perf_counter`` [s].
+        margins: the margin of each obstacle; None for an obstacle without a margin.
     """
     plan, timing, spent = solution.plan, solution.timing, time.perf_counter() - began
     if plan is None or not plan.complete:
@@ -285,7 +308,7 @@ def of_whole_arm(tool: Adaptation, solution: ArmSolution, scene: Scene, clearanc
         divided=used.n_components != tool.responsibilities.shape[1] or tool.divided,
         min_clearance=guaranteed,
         certified_clearance=guaranteed,
-        validity=_validity(scene, float(times[-1]), arm=True),
+        validity=_validity(scene, float(times[-1]), margins, arm=True),
         deviation=used.deviation(plan.displacement),
         jerk_ratio=jerk,
         jerk_reason=""
@@ -379,7 +402,8 @@ def _detour(problem: AvoidanceProblem, adapter: PathAdapter) -> Detour:
     return adapter.detour(problem)
 
 
-def _validity(scene: Scene, duration: float, *, arm: bool = False) -> str:
+def _validity(scene: Scene, duration: float, margins: Sequence[PredictionMargin | None], *, arm: bool = False) -> str:
+    """Return a text that says what a guarantee assumes and what it does not cover."""
     moving = [scene.name_of(i) for i, obstacle in enumerate(scene.obstacles) if obstacle.velocity.any()]
     covers = "it covers the tool on the planned path, but neither the links of the arm nor tracking errors"
     if arm:
@@ -387,12 +411,28 @@ def _validity(scene: Scene, duration: float, *, arm: bool = False) -> str:
     rotating = [scene.name_of(i) for i, obstacle in enumerate(scene.obstacles) if obstacle.angular_velocity.any()]
     if rotating:
         covers += f"; {' and '.join(rotating)} may rotate in any way about the obstacle's centre"
-    if not moving:
+    if not moving and not depends_on_time(scene, margins):
         return f"the guarantee holds while the obstacles stand still; {covers}"
     return (
         f"the guarantee holds only from 0 to {duration:.2f} s (arrival), and only while the motion is on time and "
-        f"{' and '.join(moving)} {'keeps' if len(moving) == 1 else 'keep'} the given velocity; {covers}"
+        f"{_assumed(scene, moving, margins)}; {covers}"
     )
+
+
+def _assumed(scene: Scene, moving: Sequence[str], margins: Sequence[PredictionMargin | None]) -> str:
+    """Return what a guarantee assumes of the obstacles."""
+    kept = f"{' and '.join(moving)} {'keeps' if len(moving) == 1 else 'keep'} the given velocity"
+    with_margin = [scene.name_of(i) for i, margin in enumerate(margins) if margin is not None]
+    if not with_margin:
+        return kept
+    margin = next(margin for margin in margins if margin is not None)
+    verb = "is" if len(with_margin) == 1 else "are"
+    apart = f"{' and '.join(with_margin)} {verb} where predicted, or off by less than {1e3 * margin.offset:.0f} mm"
+    if margin.growth > 0.0:
+        apart += f" and {1e3 * margin.growth:.0f} mm more each second"
+        apart += f" until {margin.until:.2f} s" if np.isfinite(margin.until) else ""
+    others = [name for name in moving if name not in with_margin]
+    return apart if not others else f"{apart}, and {' and '.join(others)} keep the given velocity"
 
 
 def _jerk_reason(scene: Scene, detour: Detour, ratio: float, clearance: float) -> str:
@@ -412,6 +452,8 @@ def _reason(scene: Scene, problem: AvoidanceProblem, detour: Detour, method: str
     """Return a message that says which obstacle can't be avoided, why, and what to change."""
     path, k = problem.path, problem.nominal.tool.n_spheres
     required = f"{1e3 * problem.clearance:.0f} mm required"
+    if any(margin is not None for margin in problem.nominal.tool.margins):
+        required += " beyond the margin for its prediction"
     fixed = path.fixed
     at_fixed = problem.nominal.distance[:, fixed]
     if at_fixed.min(initial=np.inf) < problem.clearance:
@@ -456,6 +498,6 @@ def _at_fixed(path: ComponentPath, name: str, sample: int, left: float, required
     at, end = path.nominal.times[sample], path.nominal.times[-1]
     where = "start" if at < 0.02 * end else "goal" if at > 0.98 * end else f"pinned point at {at:.2f} s"
     gap = f"leaves {1e3 * left:.0f} mm of clearance at the {where} ({required})"
-    lies = f"covers the {where}" if left <= 0.0 else gap
+    lies = f"covers the {where}" if left <= 0.0 and required.endswith("required") else gap
     other = where if where in {"start", "goal"} else "pinned time"
     return f"{name} {lies}; this point must not move: move the obstacle, or choose another {other}"

@@ -32,11 +32,14 @@ class Adaptation:
             number of narrower components.
         tolerance: covariance of the demonstrations along the path, shape (n, 3, 3) [m^2].
         min_clearance: smallest distance from the tool's spheres to an obstacle, at the samples [m]; inf without
-            obstacles.
-        certified_clearance: guaranteed lower bound of the clearance on the whole polyline through the samples [m].
-        only_on_schedule: whether the guarantee depends on the schedule, because an obstacle moves. The guarantee then
-            holds only while the motion is on time, which means that the tool reaches each sample of ``trajectory`` at
-            the sample's time, counted from the scene's ``stamp``. The guarantee ends with the last sample.
+            obstacles. Where an obstacle has a margin for the error of its prediction, the margin is subtracted.
+        certified_clearance: guaranteed lower bound of the clearance on the whole polyline through the samples [m]. It
+            is the clearance to the true obstacles, as long as they are within their margins of where they were
+            predicted.
+        only_on_schedule: whether the guarantee depends on the schedule, because an obstacle moves or its margin grows.
+            The guarantee then holds only while the motion is on time, which means that the tool reaches each sample of
+            ``trajectory`` at the sample's time, counted from the scene's ``stamp``. The guarantee ends with the last
+            sample.
         validity: text that says what the guarantee assumes and what it does not cover.
         deviation: largest displacement of a mean, in standard deviations of the demonstrations (Mahalanobis distance).
         jerk_ratio: largest jerk of the adapted path, divided by the largest jerk of the nominal path.

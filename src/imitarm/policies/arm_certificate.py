@@ -11,6 +11,9 @@ The signed distance to a convex obstacle is a convex function of the point, so t
 bound of the distance on the line. On the arc, the distance is at most e smaller than on the line. Where the resulting
 bound is too low, the segment is divided into halves, which makes e four times smaller.
 
+All of this remains true among obstacles with a constant velocity, in coordinates that move with the obstacle, and for
+the distance minus a margin that grows with time (:mod:`~imitarm.policies.prediction_margin`).
+
 The same proof holds for two links of the arm. In the frame of the inner link, only the joints between the two links
 move the outer link, and the distance of a moving point from a fixed point is a convex function too.
 """
@@ -18,7 +21,9 @@ move the outer link, and the distance of a moving point from a fixed point is a 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +33,7 @@ from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_path import ArmPath
 from imitarm.policies.arm_pairs import SELF, Gaps, Pairs, PairsOfLinks, PairsWithObstacle
 from imitarm.policies.certificate import crossing_of_tangents
+from imitarm.policies.prediction_margin import PredictionMargin
 from imitarm.scene.clearance import SelfClearance
 from imitarm.scene.obstacle import Obstacle
 
@@ -45,8 +51,8 @@ class ArmClearance:
     """The smallest clearance of an arm on a joint path, and where it is.
 
     Attributes:
-        room: distance minus required clearance [m]. A value of at least 0 is a guaranteed lower bound on the whole
-            path. A negative value was measured at one point of the path; at other points, the value may be lower.
+        room: distance minus required clearance and margin [m]. A value of at least 0 is a guaranteed lower bound on the
+            whole path. A negative value was measured at one point of the path; at other points, the value may be lower.
         obstacle: index of the obstacle; ``SELF`` for two links.
         sphere: index of the sphere of the arm; for two links, the sphere of the outer link.
         other: index of the sphere of the inner link; -1 for an obstacle.
@@ -73,6 +79,7 @@ class ArmAmongObstacles:
             posture. All other parts keep the clearance.
         contacts: postures in which parts of the arm may be near fixtures, shape (k, n_joints) [rad].
         own: the links that must stay apart, and their required clearance; None: links are not checked.
+        margins: the margin of each obstacle, or None for an obstacle without a margin; None: there are no margins.
 
     Attributes:
         n_obstacles: number of obstacles, which is also the index of the first fixture.
@@ -87,9 +94,14 @@ class ArmAmongObstacles:
         fixtures: Sequence[Obstacle] = (),
         contacts: Array | None = None,
         own: SelfClearance | None = None,
+        margins: Sequence[PredictionMargin | None] | None = None,
     ) -> None:
         self.arm, self.clearance, self.n_obstacles, self.own = arm, clearance, len(obstacles), own
-        self._pairs: list[Pairs] = [PairsWithObstacle(arm, i, o, clearance) for i, o in enumerate(obstacles)]
+        given = (None,) * len(obstacles) if margins is None else margins
+        self._pairs: list[Pairs] = [
+            PairsWithObstacle(arm, i, obstacle, clearance, margin)
+            for i, (obstacle, margin) in enumerate(zip(obstacles, given, strict=True))
+        ]
         if fixtures:
             postures = arm.home[None] if contacts is None else np.concatenate([arm.home[None], contacts])
             centers = ArmPath.of(arm, postures).centers
@@ -98,6 +110,15 @@ class ArmAmongObstacles:
                 self._pairs.append(PairsWithObstacle(arm, i, fixture, np.minimum(away.min(axis=0), clearance)))
         if own is not None and own.n_pairs:
             self._pairs.append(PairsOfLinks(arm, own))
+
+    @cached_property
+    def without_margins(self) -> ArmAmongObstacles:
+        """The same, with obstacles that have no margins."""
+        if all(pairs.margin is None for pairs in self._pairs):
+            return self
+        other = copy(self)
+        other._pairs = [pairs.without_margin() for pairs in self._pairs]
+        return other
 
     def gaps(self, path: ArmPath, times: Array, reach: float, *, connected: bool = True) -> Gaps:
         """Return, for each sample, the pairs whose distance is below the required clearance plus ``reach``.
@@ -206,7 +227,10 @@ class Shrinking(NamedTuple):
 
 @dataclass(eq=False)
 class _Ends:
-    """One end of each of k segments: joints, times, points, room, gradients, and distances from the joints' axes."""
+    """One end of each of k segments: joints, times, points, room, gradients, and distances from the joints' axes.
+
+    The rates are those at which the margin of the obstacle grows just before and just after this time [m/s].
+    """
 
     joints: Array
     times: Array
@@ -214,12 +238,17 @@ class _Ends:
     room: Array
     normal: Array
     radii: Array
+    before: Array
+    after: Array
 
     @classmethod
     def of(cls, pairs: Pairs, path: ArmPath, times: Array, sample: Index, pair: Index) -> _Ends:
         points, room, normal = pairs.looked_at(path, sample, pair, times)
         radii = np.maximum(path.sphere_radii(sample, pairs.sphere[pair]), _TINY) * pairs.moves[pair]
-        return cls(path.joints[sample], times, points, room, normal, radii)
+        before = after = np.zeros(len(times))
+        if pairs.margin is not None:
+            before, after = pairs.margin.slopes_before(times), pairs.margin.slopes_after(times)
+        return cls(path.joints[sample], times, points, room, normal, radii, before, after)
 
     def take(self, chosen: Index) -> _Ends:
         return _Ends(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
@@ -280,8 +309,9 @@ def _bound(
 def _bounds(start: _Ends, end: _Ends) -> Array:
     """Return a lower bound of the distance minus the required clearance on each segment, shape (k,) [m]."""
     step = end.points - start.points
-    a = np.einsum("kd,kd->k", start.normal, step)
-    b = np.einsum("kd,kd->k", end.normal, step)
+    dt = end.times - start.times
+    a = np.einsum("kd,kd->k", start.normal, step) - start.after * dt
+    b = np.einsum("kd,kd->k", end.normal, step) - end.before * dt
     low = crossing_of_tangents(start.room, a, end.room, b, 1.0)[0]
     return low - bows(np.abs(end.joints - start.joints), np.maximum(start.radii, end.radii))
 

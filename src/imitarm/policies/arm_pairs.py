@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_path import ArmPath
 from imitarm.policies.certificate import without_rotation
+from imitarm.policies.prediction_margin import PredictionMargin
 from imitarm.scene.clearance import SelfClearance
 from imitarm.scene.edged import HalfSpace
 from imitarm.scene.obstacle import Obstacle
@@ -46,9 +48,11 @@ class Pairs(ABC):
         moves: whether each joint changes the distance of each pair, shape (n_pairs, n_joints).
         group: index of the group of each pair: pairs of the same links, shape (n_pairs,).
         velocity: velocity of the obstacle, shape (3,) [m/s].
+        margin: margin of the obstacle, which the room does not include; None: there is none.
     """
 
     velocity: Array = np.zeros(3)
+    margin: PredictionMargin | None = None
     arm: ArmModel
     obstacle: int
     sphere: Index
@@ -86,18 +90,28 @@ class Pairs(ABC):
         """Return distance minus required clearance, shape (k,) [m]."""
 
     @abstractmethod
-    def _measured(self, points: Array, pair: Index) -> tuple[Array, Array]:
+    def _measured(self, points: Array, pair: Index, times: Array) -> tuple[Array, Array]:
         """Return distance minus required clearance (k,) [m], and its gradient (k, 3), at the results of ``_points``."""
 
     def _in_base(self, path: ArmPath, sample: Index, pair: Index, normals: Array) -> Array:
         """Return the gradients ``normals``, converted to the base frame."""
         return normals
 
+    def without_margin(self) -> Pairs:
+        """Return the same pairs, with an obstacle that has no margin."""
+        if self.margin is None:
+            return self
+        other = copy(self)
+        other.margin = None
+        return other
+
     def travel(self, path: ArmPath, times: Array) -> Array:
         """Return bounds of the change of distance from sample to sample, shape (n - 1, n_groups) [m]."""
         way = path.travel[:, self._of_groups[0], self._of_groups[1]]
         if self.velocity.any():
             way = way + (float(np.linalg.norm(self.velocity)) * np.diff(times))[:, None]
+        if self.margin is not None:
+            way = way + np.diff(self.margin.at(times))[:, None]
         return way
 
     def closing_speeds(self, path: ArmPath, velocity: Array) -> Array:
@@ -157,11 +171,11 @@ class Pairs(ABC):
             the room (k,) [m]; and its gradient with respect to this centre (k, 3).
         """
         points = self._points(path, sample, pair, times)
-        return points, *self._measured(points, pair)
+        return points, *self._measured(points, pair, times)
 
     def normals(self, path: ArmPath, times: Array, sample: Index, pair: Index) -> Array:
         """Return the directions in which the distances of pairs grow fastest, in the base frame, shape (k, 3)."""
-        normals = self._measured(self._points(path, sample, pair, times[sample]), pair)[1]
+        normals = self._measured(self._points(path, sample, pair, times[sample]), pair, times[sample])[1]
         return self._in_base(path, sample, pair, normals)
 
 
@@ -185,8 +199,15 @@ def _blocks(size: int, reach: Array, travel: Array | None) -> tuple[Index, Array
 class PairsWithObstacle(Pairs):
     """The pairs of one obstacle with every sphere of the arm."""
 
-    def __init__(self, arm: ArmModel, index: int, obstacle: Obstacle, clearance: Array | float) -> None:
-        self.arm, self.obstacle, n = arm, index, len(arm.cover.radii)
+    def __init__(
+        self,
+        arm: ArmModel,
+        index: int,
+        obstacle: Obstacle,
+        clearance: Array | float,
+        margin: PredictionMargin | None = None,
+    ) -> None:
+        self.arm, self.obstacle, self.margin, n = arm, index, margin, len(arm.cover.radii)
         self._solid = without_rotation(obstacle)
         self.velocity = self._solid.velocity
         self.sphere, self.other, self.first = np.arange(n), np.full(n, -1), np.zeros(n, dtype=np.intp)
@@ -204,6 +225,8 @@ class PairsWithObstacle(Pairs):
         if self.velocity.any():
             centers = centers - times[samples, None, None] * self.velocity
         farthest = self._kept_off + limit[:, self.group]
+        if self.margin is not None:
+            farthest = farthest + self.margin.at(times[samples])[:, None]
         if self._flat:
             row, pair = np.nonzero(self._solid.distances_at(centers, gradient=False)[0] < farthest)
             return row, pair
@@ -218,11 +241,16 @@ class PairsWithObstacle(Pairs):
 
     def _room(self, path: ArmPath, sample: Index, pair: Index, times: Array) -> Array:
         points = self._points(path, sample, pair, times)
-        return np.asarray(self._solid.distances_at(points, gradient=False)[0] - self._kept_off[pair])
+        return np.asarray(self._solid.distances_at(points, gradient=False)[0] - self._distances_kept(pair, times))
 
-    def _measured(self, points: Array, pair: Index) -> tuple[Array, Array]:
+    def _measured(self, points: Array, pair: Index, times: Array) -> tuple[Array, Array]:
         distance, normal = self._solid.distances_at(points, gradient=True)
-        return distance - self._kept_off[pair], normal
+        return distance - self._distances_kept(pair, times), normal
+
+    def _distances_kept(self, pair: Index, times: Array) -> Array:
+        """Return the required distance of the spheres' centres of pairs at times (k,) [s], shape (k,) [m]."""
+        kept = self._kept_off[pair]
+        return np.asarray(kept if self.margin is None else kept + self.margin.at(times))
 
 
 class PairsOfLinks(Pairs):
@@ -274,7 +302,7 @@ class PairsOfLinks(Pairs):
         away = self._away(path, sample, pair)
         return np.sqrt(np.einsum("ki,ki->k", away, away)) - self._kept_off[pair]
 
-    def _measured(self, points: Array, pair: Index) -> tuple[Array, Array]:
+    def _measured(self, points: Array, pair: Index, times: Array) -> tuple[Array, Array]:
         length = np.sqrt(np.einsum("ki,ki->k", points, points))
         normal = points / np.maximum(length, 1e-12)[:, None]
         return length - self._kept_off[pair], normal

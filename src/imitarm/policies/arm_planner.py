@@ -109,6 +109,7 @@ class ArmPlanner:
         free_start: whether the self-motion may change the posture at the start.
         tilts: possible rotations of the tool away from the learned rotation; at the goal, ``max_tilt`` limits them too.
         begun: whether the motion has begun, so that the self-motion must not change the velocity at the start.
+        spare: clearance that is planned for in addition, if possible, but not required [m].
 
     Attributes:
         coarse: indices of the few samples that are planned first, before all samples, shape (k,).
@@ -128,6 +129,7 @@ class ArmPlanner:
         tilts: Tilts,
         free_start: bool = False,
         begun: bool = False,
+        spare: float = 0.0,
     ) -> None:
         self.around, self.arm, self.components, self.free_start, self.begun = (
             around,
@@ -137,7 +139,7 @@ class ArmPlanner:
             begun,
         )
         self.quaternions, self.max_tilt, self.allowed = quaternions, max_tilt, allowed
-        self.times = components.nominal.times
+        self.spare, self.times = spare, components.nominal.times
         self.clock = self.times
         n = len(self.times)
         self.coarse = np.unique(np.append(np.arange(0, n, _STRIDE), n - 1))
@@ -192,7 +194,7 @@ class ArmPlanner:
     def _improved(self, path: ArmPath, displacement: Array, tilt: Array, samples: Index, rounds: int) -> ArmPlan:
         """Return the first plan that keeps all clearances (see :meth:`_evaluated`), or else the best attempt."""
         best: ArmPlan | None = None
-        since, margin, calmed = 0, _MARGIN, 0
+        since, margin, calmed = 0, _MARGIN + self.spare, 0
         for _ in range(rounds + 1):
             gaps = None
             if len(samples) < len(self.times):

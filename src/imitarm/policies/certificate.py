@@ -7,6 +7,9 @@ the segment, until either the bound reaches the required clearance or one of the
 
 An obstacle that moves at a constant velocity ``v`` stands still in coordinates that move with it. If ``t v`` is
 subtracted from the path, the same proof is exact for a moving obstacle, as long as the path is executed on time.
+
+An obstacle may have a margin that grows with time (:mod:`~imitarm.policies.prediction_margin`). The distance minus this
+margin is a convex function too. In this module, all distances to such an obstacle are distances minus its margin.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from numpy.typing import NDArray
 
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import rotate
+from imitarm.policies.prediction_margin import PredictionMargin
 from imitarm.scene.edged import HalfSpace
 from imitarm.scene.obstacle import Obstacle
 from imitarm.scene.rounded import Sphere
@@ -77,6 +81,8 @@ class ToolAmongObstacles:
             base frame. The entry is None when all its vectors are zero.
         bows: for each segment between two samples, how far the rotation of the tool can move the centre of a sphere
             away from the straight line between the centre's positions at the two samples, shape (n_spheres, n - 1) [m].
+        times: time of each sample, shape (n,) [s].
+        margins: the margin of each obstacle; None: it has none.
     """
 
     obstacles: tuple[Obstacle, ...]
@@ -84,9 +90,17 @@ class ToolAmongObstacles:
     radii: Array
     offsets: tuple[Array | None, ...]
     bows: Array
+    times: Array
+    margins: tuple[PredictionMargin | None, ...]
 
     @classmethod
-    def along(cls, nominal: Trajectory, spheres: Array, obstacles: Sequence[Obstacle]) -> ToolAmongObstacles:
+    def along(
+        cls,
+        nominal: Trajectory,
+        spheres: Array,
+        obstacles: Sequence[Obstacle],
+        margins: Sequence[PredictionMargin | None] | None = None,
+    ) -> ToolAmongObstacles:
         """Place the spheres and the obstacles along a path.
 
         Args:
@@ -94,6 +108,7 @@ class ToolAmongObstacles:
             spheres: centres in the tool's frame and radii, rows x y z r, shape (n_spheres, 4) [m].
             obstacles: obstacles at time 0; obstacles with a velocity move from there. A rotating obstacle is replaced
                 by a sphere about its centre that contains it.
+            margins: the margin of each obstacle, or None for an obstacle without a margin; None: there are no margins.
 
         Raises:
             InputError: when a half-space rotates.
@@ -115,7 +130,9 @@ class ToolAmongObstacles:
             travelled = nominal.times[:, None] * obstacle.velocity
             moved = np.zeros((len(spheres), n, 3)) if centres is None else centres
             offsets.append(moved - travelled)
-        return cls(solids, spheres, np.ascontiguousarray(spheres[:, 3]), tuple(offsets), bows)
+        given = (None,) * len(solids) if margins is None else tuple(margins)
+        radii = np.ascontiguousarray(spheres[:, 3])
+        return cls(solids, spheres, radii, tuple(offsets), bows, nominal.times, given)
 
     @property
     def n_spheres(self) -> int:
@@ -151,15 +168,51 @@ class ToolAmongObstacles:
         """Return the distance (..., m) [m] of a pair; the arguments are those of :meth:`centres`."""
         obstacle, sphere = divmod(pair, self.n_spheres)
         centres = self.centres(pair, positions, samples)
-        return self.obstacles[obstacle].distances_at(centres, gradient=False)[0] - self.radii[sphere]
+        kept_off = self.radii[sphere] + self.margin(pair, samples)
+        return np.asarray(self.obstacles[obstacle].distances_at(centres, gradient=False)[0] - kept_off)
 
-    def distance_and_normal(self, pair: int, centres: Array) -> tuple[Array, Array]:
-        """Return the distance (...) [m] from a sphere's surface to the obstacle, and its gradient (..., 3)."""
+    def margin(self, pair: int, samples: Index | slice) -> Array | float:
+        """Return the margin of a pair's obstacle at m samples, shape (m,) [m]; the number 0 if it has none."""
+        margin = self.margins[pair // self.n_spheres]
+        return 0.0 if margin is None else margin.at(self.times[samples])
+
+    def margin_between(self, pair: int, segment: Index, fraction: Array) -> Array | float:
+        """Return the margin of a pair's obstacle at points between samples; the number 0 if it has none.
+
+        Args:
+            pair: index of the pair.
+            segment: index of the sample before each point, shape (m,).
+            fraction: position of the point between this sample (0) and the next one (1), shape (m,).
+
+        Returns:
+            Shape (m,) [m], or 0.
+        """
+        margin = self.margins[pair // self.n_spheres]
+        if margin is None:
+            return 0.0
+        return margin.at(self.times[segment] + fraction * (self.times[segment + 1] - self.times[segment]))
+
+    def distance_and_normal(self, pair: int, centres: Array, margin: Array | float = 0.0) -> tuple[Array, Array]:
+        """Return the distance (...) [m] from a sphere's surface to the obstacle, and its gradient (..., 3).
+
+        Args:
+            pair: index of the pair.
+            centres: results of :meth:`centres`, shape (..., 3) [m].
+            margin: results of :meth:`margin` for the same points, broadcast to their shape (...) [m].
+        """
         obstacle, sphere = divmod(pair, self.n_spheres)
         distance, normal = self.obstacles[obstacle].distances_at(centres, gradient=True)
-        return distance - self.radii[sphere], normal
+        return np.asarray(distance - (self.radii[sphere] + margin)), normal
 
-    def exits(self, pair: int, points: Array, directions: Array, target: float, tolerance: float) -> Array:
+    def exits(
+        self,
+        pair: int,
+        points: Array,
+        directions: Array,
+        target: float,
+        tolerance: float,
+        margin: Array | float = 0.0,
+    ) -> Array:
         """Return how far points must move along directions to leave the inflated obstacle.
 
         The inflated obstacle contains all points at which the pair's distance is below ``target``. Newton's method
@@ -172,6 +225,7 @@ class ToolAmongObstacles:
             directions: unit rows, shape (m, 3).
             target: distance to reach [m].
             tolerance: largest accepted excess of the distance over ``target`` [m].
+            margin: results of :meth:`margin` for the same points, shape (p,) [m].
 
         Returns:
             Displacements along the directions, shape (m, p) [m]; inf where the ray never leaves the obstacle.
@@ -179,15 +233,15 @@ class ToolAmongObstacles:
         obstacle, sphere = divmod(pair, self.n_spheres)
         solid = self.obstacles[obstacle]
         if isinstance(solid, HalfSpace):
-            missing = np.maximum(target + self.radii[sphere] - solid.signed_distance(points), 0.0)
+            missing = np.maximum(target + (self.radii[sphere] + margin) - solid.signed_distance(points), 0.0)
             slope = directions @ solid.normal
             lift = missing / np.where(slope > 1e-9, slope, np.nan)[:, None]
             return np.where(missing == 0.0, 0.0, np.where(np.isnan(lift), np.inf, lift))
         # Beyond the obstacle's farthest plane along a direction every point is clear: begin there.
         farthest = np.einsum("md,md->m", solid.support(directions), directions) + target + self.radii[sphere]
-        lift = np.maximum(farthest[:, None] - directions @ points.T, 0.0)
+        lift = np.maximum(farthest[:, None] - directions @ points.T + margin, 0.0)
         for _ in range(_NEWTON_STEPS):
-            d, n = self.distance_and_normal(pair, points + lift[..., None] * directions[:, None, :])
+            d, n = self.distance_and_normal(pair, points + lift[..., None] * directions[:, None, :], margin)
             gap = d - target
             slope = (n @ directions[:, :, None])[..., 0]
             falling = slope <= 1e-9  # past the point of closest approach: the ray never enters
@@ -199,7 +253,7 @@ class ToolAmongObstacles:
     def clearance_of(self, positions: Array) -> PathClearance:
         """Return the distances and normals of every pair along a path of the tip (n, 3)."""
         n, k = len(positions), self.n_spheres
-        if k == 1 and len(self.obstacles) == 1 and self.offsets[0] is None:
+        if k == 1 and len(self.obstacles) == 1 and self.offsets[0] is None and self.margins[0] is None:
             d, normals = self.obstacles[0].distances_at(positions, gradient=True)
             return PathClearance(self, positions, (d - self.radii[0])[None], normals[None])
         distance, normal = np.empty((self.n_pairs, n)), np.empty((self.n_pairs, n, 3))
@@ -207,7 +261,10 @@ class ToolAmongObstacles:
             rows, offset = slice(o * k, (o + 1) * k), self.offsets[o]
             centres = positions if offset is None else positions + offset
             d, normal[rows] = obstacle.distances_at(centres, gradient=True)
+            margin = self.margins[o]
             distance[rows] = d - self.radii[:, None]
+            if margin is not None:
+                distance[rows] -= margin.at(self.times)
         return PathClearance(self, positions, distance, normal)
 
 
@@ -254,6 +311,11 @@ class PathClearance:
                 step[o * k : (o + 1) * k] = tip if offset is None else tip + np.diff(offset, axis=1)
         a = (self.normal[:, :-1, None, :] @ step[..., None])[..., 0, 0]  # slopes over s in [0, 1] on each segment
         b = (self.normal[:, 1:, None, :] @ step[..., None])[..., 0, 0]
+        for o, margin in enumerate(tool.margins):
+            if margin is not None:
+                rows, dt = slice(o * k, (o + 1) * k), np.diff(tool.times)
+                a[rows] -= margin.slopes_after(tool.times[:-1]) * dt
+                b[rows] -= margin.slopes_before(tool.times[1:]) * dt
         low = crossing_of_tangents(self.distance[:, :-1], a, self.distance[:, 1:], b, 1.0)[0]
         return low - (np.tile(tool.bows, (len(tool.obstacles), 1)) if tool.bows.any() else 0.0)
 
@@ -293,13 +355,20 @@ class PathClearance:
         f0, f1 = self.distance[pair, j], self.distance[pair, j + 1]
         a = np.einsum("sd,sd->s", self.normal[pair, j], step)
         b = np.einsum("sd,sd->s", self.normal[pair, j + 1], step)
+        margin, dt = self.tool.margins[pair // self.tool.n_spheres], self.tool.times[j + 1] - self.tool.times[j]
+        if margin is not None:
+            a -= margin.slopes_after(self.tool.times[j]) * dt
+            b -= margin.slopes_before(self.tool.times[j + 1]) * dt
         low, at = crossing_of_tangents(f0, a, f1, b, 1.0)
         close = np.zeros(len(j), dtype=bool)
         for _ in range(_MAX_PROBES):
             if np.all(close | (low - bow >= clearance)):
                 break
-            f, n = self.tool.distance_and_normal(pair, start + at[:, None] * step)
+            kept = self.tool.margin_between(pair, j, at)
+            f, n = self.tool.distance_and_normal(pair, start + at[:, None] * step, kept)
             slope = np.einsum("sd,sd->s", n, step)
+            if margin is not None:
+                slope -= margin.slopes_after(self.tool.times[j] + at * dt) * dt
             close |= f - bow < clearance
             falls, rises = ~close & (slope <= 0.0), ~close & (slope > 0.0)
             left, f0, a = np.where(falls, (at, f, slope), (left, f0, a))
@@ -316,7 +385,7 @@ class PathClearance:
             j, s = points.segment[of], points.fraction[of, None]
             start = self.tool.centres(i, self.positions[j], j)
             step = self.tool.centres(i, self.positions[j + 1], j + 1) - start
-            d, normal[of] = self.tool.distance_and_normal(i, start + s * step)
+            d, normal[of] = self.tool.distance_and_normal(i, start + s * step, self.tool.margin_between(i, j, s[:, 0]))
             distance[of] = d - self.tool.bows[i % self.tool.n_spheres, j]
         return distance, normal
 

@@ -333,7 +333,8 @@ class _SideSearch:
         A lift above ``MAX_LIFT`` becomes inf.
         """
         points = self.tool.centres(pair, positions[rows], rows)
-        lift = self.tool.exits(pair, points, directions, self.target, _LIFT_TOLERANCE)
+        margin = self.tool.margin(pair, rows)
+        lift = self.tool.exits(pair, points, directions, self.target, _LIFT_TOLERANCE, margin)
         return np.where(lift > MAX_LIFT, np.inf, lift)
 
     def _affected(self, rows: Index, worst: int, here: PathClearance) -> Index:

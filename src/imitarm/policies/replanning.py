@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike
 
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel, ArmState
-from imitarm.policies.adaptation import allowed_directions, of_whole_arm, tilt_limits
+from imitarm.policies.adaptation import allowed_directions, depends_on_time, of_whole_arm, tilt_limits
 from imitarm.policies.adapted_path import Adaptation
 from imitarm.policies.component_path import STILL
+from imitarm.policies.prediction_margin import Margin, margins_in
 from imitarm.policies.remainder import Remainder
 from imitarm.policies.whole_arm import ArmTask, solve
 from imitarm.scene.scene import Scene
@@ -34,6 +35,8 @@ def replan(
     max_tilt: float | None = None,
     goal_tilt: float = 0.0,
     allowance: float = 0.0,
+    margin: Margin | None = None,
+    margin_horizon: float | None = None,
 ) -> Adaptation:
     """Plan the rest of a motion again, for example because an obstacle is not where it was.
 
@@ -57,6 +60,8 @@ def replan(
         goal_tilt: largest such rotation at the goal [rad]; see :func:`adapt`.
         allowance: additional clearance for tracking errors, used if ``previous`` has it and a
             path with this larger clearance is found [m].
+        margin: bound of the error with which obstacles are predicted; see :func:`adapt`.
+        margin_horizon: time since an obstacle was seen after which its margin does not grow [s]; see :func:`adapt`.
 
     Returns:
         The adaptation of the rest of the motion; check ``feasible`` before executing it. If it is not feasible, the arm
@@ -87,6 +92,7 @@ def replan(
     rest = Remainder.of(plan, float(np.interp(now, done, times)), state)
     limit = tilt_limits(rest.components, max_tilt, at_goal)
     limit = np.maximum(limit, _BEYOND * np.linalg.norm(rest.tilts.fixed, axis=1))  # where the arm is, it may be
+    around = margins_in(scene, margin, margin_horizon)
     positions, quaternions = previous.nominal.at(rest.components.nominal.times + rest.begins)
     nominal = Trajectory(rest.components.nominal.times, positions, quaternions)
     unplanned = replace(
@@ -94,16 +100,16 @@ def replan(
         nominal=nominal,
         trajectory=nominal,
         tolerance=rest.components.tolerance,
-        only_on_schedule=any(obstacle.velocity.any() for obstacle in scene.obstacles),
+        only_on_schedule=depends_on_time(scene, around),
         joints=None,
         approach=None,
         arm_plan=None,
     )
-    margins = (extra, 0.0) if previous.certified_clearance >= clearance + extra else (0.0,)
-    for more in dict.fromkeys(margins):
-        task = ArmTask(arm, q, scene, clearance + more, allowed, limit, at_goal, more, rest)
+    extras = (extra, 0.0) if previous.certified_clearance >= clearance + extra else (0.0,)
+    for more in dict.fromkeys(extras):
+        task = ArmTask(arm, q, scene, clearance + more, allowed, limit, at_goal, more, rest, around)
         solution = solve(task, rest.components, rest.displacement)
-        found = of_whole_arm(unplanned, solution, scene, clearance + more, began)
+        found = of_whole_arm(unplanned, solution, scene, clearance + more, began, around)
         if found.feasible:
             break
     return found

@@ -98,6 +98,10 @@ def retimed(
 def safe_rates(around: ArmAmongObstacles, path: ArmPath, times: Array, clock: Array, allowance: float) -> Array:
     """Return the largest rate ds/dt at each sample at which no distance shrinks faster than the safety filter allows.
 
+    The safety filter measures distances to where the obstacles are predicted, so margins are left out. An obstacle that
+    approaches by itself does not slow the motion down: the arm would still be in its way. The path and its times must
+    keep the clearance in that case.
+
     Args:
         around: the arm, its obstacles and the required clearances.
         path: the arm at n samples.
@@ -111,11 +115,11 @@ def safe_rates(around: ArmAmongObstacles, path: ArmPath, times: Array, clock: Ar
     velocity = np.gradient(path.joints, times, axis=0)
     obstacles = Shrinking(_APPROACH_RATE, max(allowance - _FILTER_MARGIN, 0.0), _REACH)
     links = Shrinking(_SELF_RATE, SELF_CLEARANCE - _FILTER_SELF, _REACH)
-    gaps = around.closing(path, clock, velocity, obstacles, links)
+    gaps = around.without_margins.closing(path, clock, velocity, obstacles, links)
     own = gaps.obstacle == SELF
     rate, margin, _ = (np.where(own, a, b) for a, b in zip(links, obstacles, strict=True))
     rates, drift = gaps.rates(np.arange(len(gaps)))
-    allowed = np.maximum(rate * (np.maximum(gaps.room, 0.0) + margin) + drift, _CREEP)
+    allowed = np.maximum(rate * (np.maximum(gaps.room, 0.0) + margin) + np.maximum(drift, 0.0), _CREEP)
     approach = np.maximum(-np.einsum("kj,kj->k", rates, velocity[gaps.sample]), 1e-9)
     fastest = np.ones(len(path))
     np.minimum.at(fastest, gaps.sample, allowed / approach)

@@ -172,9 +172,10 @@ class Roadmap:
 
     def _distances_and_normals(self, points: Array, samples: Index) -> tuple[Array, Array]:
         """Return the distance (n_pairs, m) [m] of each pair at positions of the tip (m, 3), and its gradient."""
+        tool = self.tool
         pairs = [
-            self.tool.distance_and_normal(pair, self.tool.centres(pair, points, samples))
-            for pair in range(self.tool.n_pairs)
+            tool.distance_and_normal(pair, tool.centres(pair, points, samples), tool.margin(pair, samples))
+            for pair in range(tool.n_pairs)
         ]
         return np.stack([distance for distance, _ in pairs]), np.stack([normal for _, normal in pairs])
 
@@ -223,10 +224,11 @@ class Roadmap:
         answer = np.zeros((len(centre), len(rays)))
         for sphere in range(k):
             points = self.tool.centres(obstacle * k + sphere, centre, self.layers)
-            reach = self.clearance + self.tool.radii[sphere] + MAX_DISPLACEMENT
+            margin = np.broadcast_to(self.tool.margin(obstacle * k + sphere, self.layers), self.layers.shape)
+            reach = self.clearance + (self.tool.radii[sphere] + margin) + MAX_DISPLACEMENT
             near = np.flatnonzero(solid.signed_distance(points) < reach)
             if len(near):
-                lift = self.tool.exits(obstacle * k + sphere, points[near], rays, self.clearance, 1e-4)
+                lift = self.tool.exits(obstacle * k + sphere, points[near], rays, self.clearance, 1e-4, margin[near])
                 answer[near] = np.maximum(answer[near], lift.T)
         return answer
 
@@ -251,13 +253,16 @@ class Roadmap:
         spread = np.swapaxes(positions, 0, 1)  # (n_nodes, n_layers, 3)
         for pair in range(self.tool.n_pairs):
             centres = np.ascontiguousarray(np.swapaxes(self.tool.centres(pair, spread, self.layers), 0, 1))
-            distance, normal = self.tool.distance_and_normal(pair, centres)
+            margin = np.broadcast_to(self.tool.margin(pair, self.layers), self.layers.shape)
+            growth = np.diff(margin)  # from layer to layer
+            distance, normal = self.tool.distance_and_normal(pair, centres, margin[:, None])
             f0, f1 = distance.take(first), distance.take(last)
             offset = self.tool.offsets[pair // self.tool.n_spheres]
             travelled = length
             if offset is not None:
                 shift = np.diff(offset[pair % self.tool.n_spheres, self.layers], axis=0)
                 travelled = length + np.sqrt(np.einsum("ld,ld->l", shift, shift)).take(first // n)
+            travelled = travelled + growth.take(first // n) if growth.any() else travelled
             # The distance changes by at most one metre per metre: an edge as far away as this keeps the clearance.
             near = np.flatnonzero(f0 + f1 - travelled < 2.0 * self.clearance)
             if len(near):
@@ -265,6 +270,8 @@ class Roadmap:
                 step = _changes(_columns(centres), i, j)
                 a = np.einsum("ke,ke->e", normals.take(i, axis=1), step)
                 b = np.einsum("ke,ke->e", normals.take(j, axis=1), step)
+                if growth.any():
+                    a, b = a - growth.take(i // n), b - growth.take(i // n)
                 low = crossing_of_tangents(f0.take(near), a, f1.take(near), b, 1.0)[0]
                 violation[near] = np.maximum(violation.take(near), self.clearance - _JUST_OUTSIDE - low)
         change = _changes(_columns(self.nodes), first, last)

@@ -33,6 +33,7 @@ from imitarm.policies.arm_planner import JOINT_LIMIT, TILT_LEVER, TILT_LIMIT, Ar
 from imitarm.policies.component_path import ComponentPath
 from imitarm.policies.goal_postures import GoalPosture, GoalSearch, clear_postures
 from imitarm.policies.least_detour import SMOOTHNESS, AllowedDirections
+from imitarm.policies.prediction_margin import PredictionMargin
 from imitarm.policies.remainder import Remainder
 from imitarm.policies.retiming import SELF_CLEARANCE, Timing, retimed, safe_rates
 from imitarm.policies.tilts import Tilts
@@ -43,7 +44,8 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 _REACH = 0.15  # [m] largest clearance that is reported
-_RETIMINGS = 4  # among moving obstacles
+_RETIMINGS = 6  # among moving obstacles
+_SPARE = 2e-3  # [m] of clearance that is planned for, because new execution times change the distances
 _AHEAD = 0.05  # of the duration: a place this close to the goal is the goal
 _SIDES = 8  # directions tried across the path
 _AWAY = (0.1, 0.2)  # [m] by which the path is moved to another side
@@ -90,6 +92,7 @@ class ArmTask:
         max_tilt: largest rotation of the tool away from the learned rotation at each sample, shape (n,) [rad].
         allowance: ``clearance`` minus the clearance that the safety filter keeps [m].
         rest: the rest of a motion that has begun; None: the motion begins at rest.
+        margins: the margin of each obstacle, or None for an obstacle without a margin; None: there are no margins.
     """
 
     arm: ArmModel
@@ -101,6 +104,7 @@ class ArmTask:
     goal_tilt: float
     allowance: float
     rest: Remainder | None = None
+    margins: Sequence[PredictionMargin | None] | None = None
 
 
 def solve(task: ArmTask, path: ComponentPath, displacement: Array) -> ArmSolution:
@@ -132,6 +136,7 @@ def solve(task: ArmTask, path: ComponentPath, displacement: Array) -> ArmSolutio
             continue
         found = search.solution(planner, plan)
         if found is None:
+            search.mistimed = True
             continue
         late = found if late is None or found.duration < late.duration else late
         if task.rest is not None or found.reason or late.duration <= _LATE * path.nominal.duration:
@@ -167,15 +172,24 @@ class _Search:
         contacts = track(task.arm, task.start, nominal.positions, self._quaternions)[::4] if fixtures else None
         own = links_apart(task.arm)
         self._around = ArmAmongObstacles(
-            task.arm, task.scene.obstacles, task.clearance, fixtures=fixtures, contacts=contacts, own=own
+            task.arm,
+            task.scene.obstacles,
+            task.clearance,
+            fixtures=fixtures,
+            contacts=contacts,
+            own=own,
+            margins=task.margins,
         )
         self.start = self._around.clearance_at(ArmPath.of(task.arm, task.start[None]), np.zeros(1), _REACH)
         self._tilts = Tilts.between_ends(self._times, tilted_goal=task.goal_tilt > 0.0, window=path.at_pins)
-        self._moving = any(obstacle.velocity.any() for obstacle in task.scene.obstacles)
+        self._margins = task.margins or (None,) * len(task.scene.obstacles)
+        growing = any(margin is not None and margin.growth > 0.0 for margin in self._margins)
+        self._moving = growing or any(obstacle.velocity.any() for obstacle in task.scene.obstacles)
         self._first: _Attempt | None = None
         self._worst: ArmClearance | None = None
         self._failed: list[tuple[ArmPlanner, ArmPlan]] = []
         self._goals: GoalSearch | None = None
+        self.mistimed = False  # whether a plan was clear at the learned times, but not at times within the limits
 
     def attempts(self) -> Iterator[_Attempt]:
         """Yield the first guesses with which the attempts begin.
@@ -289,6 +303,7 @@ class _Search:
             smoothness=smoothness,
             free_start=free_start,
             begun=rest is not None,
+            spare=_SPARE if self._moving else 0.0,
         )
 
     def _followed(self, planner: ArmPlanner, displacement: Array, goal: GoalPosture | None = None) -> _Attempt:
@@ -376,10 +391,18 @@ class _Search:
         else:
             fixture = scene.fixtures[found.obstacle - n]
             name = fixture.name or fixture.kind
+        if found.obstacle < n and self._margins[found.obstacle] is not None:
+            name += ", beyond the margin for its prediction"
         return f"{link} is {left:.0f} mm from {name} ({1e3 * self.task.clearance:.0f} mm required)"
 
     def refusal(self, best: ArmPlan | None) -> str:
         """Return why no plan was found."""
+        if self.mistimed and (best is None or self._goals is None or self._goals.found):
+            return (
+                "a joint path was found on which the whole arm is clear of the moving obstacles at the learned times, "
+                "but not at times within the limits of the arm: wait until an obstacle has passed, or show the motion "
+                "more slowly"
+            )
         if best is None:
             return f"{self.task.arm.name} can't move its tool along the path: move the path nearer to the arm"
         first = f"on the path planned for the tool alone, {self._placed(self._on_first_path())}; "
