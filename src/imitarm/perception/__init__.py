@@ -5,8 +5,13 @@ from __future__ import annotations
 from imitarm.perception.association import assign
 from imitarm.perception.consistency import Consistency
 from imitarm.perception.depth_frame import DepthFrame, Intrinsics
+from imitarm.perception.depth_noise import DepthNoise
 from imitarm.perception.detection import Detection
 from imitarm.perception.margins import CoverageMargin
+from imitarm.perception.obstacle_detector import ObstacleDetector
+from imitarm.perception.point_cloud import PointCloud
+from imitarm.perception.segmentation import fit_plane
+from imitarm.perception.self_filter import SelfFilter
 from imitarm.perception.tracker import ObstacleTracker
 from imitarm.perception.tracks import TrackedObstacle
 
@@ -14,9 +19,14 @@ __all__ = [
     "Consistency",
     "CoverageMargin",
     "DepthFrame",
+    "DepthNoise",
     "Detection",
     "Intrinsics",
+    "ObstacleDetector",
     "ObstacleTracker",
+    "PointCloud",
+    "SelfFilter",
     "TrackedObstacle",
     "assign",
+    "fit_plane",
 ]

@@ -91,6 +91,7 @@ class DepthFrame:
             (height, width) [m]; nan where nothing was measured. 0 and infinity are replaced by nan.
         intrinsics: the camera.
         camera_to_base: pose of the camera when the image was taken.
+        color: red, green and blue of each pixel, 0 to 1, shape (height, width, 3); None for a camera without colours.
 
     Raises:
         InputError: when the shape does not match the camera, a depth is negative, or a number is not finite.
@@ -100,6 +101,7 @@ class DepthFrame:
     depth: Array
     intrinsics: Intrinsics
     camera_to_base: Pose
+    color: Array | None = None
 
     def __post_init__(self) -> None:
         camera = instance(self.intrinsics, Intrinsics, "DepthFrame: intrinsics")
@@ -114,6 +116,15 @@ class DepthFrame:
         depth[(depth == 0.0) | np.isinf(depth)] = np.nan
         depth.setflags(write=False)
         object.__setattr__(self, "depth", depth)
+        if self.color is not None:
+            color = np.array(real_array(self.color, (camera.height, camera.width, 3), "DepthFrame: color"))
+            color.setflags(write=False)
+            object.__setattr__(self, "color", color)
+
+    @property
+    def spacing(self) -> float:
+        """Angle between the rays of neighbouring pixels near the optical axis [rad]."""
+        return 1.0 / min(self.intrinsics.fx, self.intrinsics.fy)
 
     def points(self) -> Array:
         """Return the measured points in the base frame, row by row of the image, shape (n, 3) [m]."""

@@ -1,0 +1,65 @@
+"""FreeSpace: where a depth image shows that nothing is, and where something may be hidden."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.perception.depth_frame import DepthFrame
+from imitarm.scene import Obstacle
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class FreeSpace:
+    """The space that a camera has seen to be empty.
+
+    A point is seen to be empty if the ray of its pixel ends behind it. A point behind a surface, outside of the image,
+    or in a pixel that measured nothing is hidden: an obstacle may be there. Only in the middle of an area in which
+    nothing was measured, the space counts as empty, because the surface behind it is out of the camera's range.
+    Points inside the known surfaces, such as a table, belong to no obstacle and count as empty.
+
+    Args:
+        frame: the image; None: nothing is known, as for a point cloud.
+        surfaces: known objects that are not obstacles, such as the table.
+        sigma: standard deviation of a depth as a function of the depth [m].
+    """
+
+    def __init__(self, frame: DepthFrame | None, surfaces: Sequence[Obstacle], sigma: Callable[[Array], Array]) -> None:
+        self._frame, self._surfaces, self._sigma = frame, surfaces, sigma
+        if frame is not None:
+            nothing = np.pad(np.isnan(frame.depth), 1, constant_values=False)
+            alone = np.ones(frame.depth.shape, dtype=bool)
+            height, width = frame.depth.shape
+            for row in range(3):
+                for column in range(3):
+                    alone &= nothing[row : row + height, column : column + width]
+            self._depth = np.where(alone, np.inf, frame.depth)
+            self._base_to_camera = frame.camera_to_base.inverse()
+
+    def empty(self, points: Array, margin: float = 0.01) -> Mask:
+        """Return which points (..., 3) are seen to be empty, shape (...).
+
+        Args:
+            points: points in the base frame [m].
+            margin: distance by which the ray must pass the point, in addition to three standard deviations [m].
+        """
+        empty = np.zeros(points.shape[:-1], dtype=bool)
+        for surface in self._surfaces:
+            empty |= surface.distances_at(points, False)[0] < -margin
+        if self._frame is None:
+            return empty
+        camera = self._frame.intrinsics
+        x, y, z = np.moveaxis(self._base_to_camera.apply(points), -1, 0)
+        ahead = z > 1e-3
+        z = np.where(ahead, z, 1.0)
+        column = np.rint(camera.fx * x / z + camera.cx)
+        row = np.rint(camera.fy * y / z + camera.cy)
+        inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        pixel = np.where(inside, row, 0).astype(np.intp), np.where(inside, column, 0).astype(np.intp)
+        with np.errstate(invalid="ignore"):
+            behind = self._depth[pixel] > z + margin + 3.0 * self._sigma(z)
+        return empty | (inside & behind)

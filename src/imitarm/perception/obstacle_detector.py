@@ -1,0 +1,260 @@
+"""ObstacleDetector: from one depth image or point cloud to the obstacles in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import binary_dilation
+
+from imitarm.errors import InputError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.perception import segmentation
+from imitarm.perception.depth_frame import DepthFrame, Intrinsics
+from imitarm.perception.depth_noise import DepthNoise
+from imitarm.perception.detection import Detection
+from imitarm.perception.free_space import FreeSpace
+from imitarm.perception.point_cloud import PointCloud
+from imitarm.perception.self_filter import SelfFilter
+from imitarm.perception.shape_choice import SHAPES, fit_shape
+from imitarm.perception.shape_fit import Visible
+from imitarm.scene import Obstacle, Scene
+from imitarm.validation import choice, finite_array, finite_number, flag, instance, whole_number
+
+Array = NDArray[np.float64]
+Frame = DepthFrame | PointCloud
+
+_SLANTED = 2.5  # neighbouring points of a slanted surface are farther apart than the rays by up to this factor
+_CLEARLY_CONCAVE = 0.006  # [m] above the noise
+_MOST_PARTS = 4  # of one cluster
+_MOST_VOXELS = 300  # of one object; more don't improve the fit
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+class _Measured(NamedTuple):
+    """Points in the base frame (n, 3), their depths (n,), pixels (n,) of an image, colours, and the camera."""
+
+    points: Array
+    depth: Array
+    pixel: NDArray[np.intp] | None
+    colors: Array | None
+    origin: Array
+    spacing: float
+
+    def only(self, kept: NDArray[np.bool_]) -> _Measured:
+        pixel = None if self.pixel is None else self.pixel[kept]
+        colors = None if self.colors is None else self.colors[kept]
+        return self._replace(points=self.points[kept], depth=self.depth[kept], pixel=pixel, colors=colors)
+
+
+class ObstacleDetector:
+    """Finds obstacles in depth images and point clouds.
+
+    The steps of :meth:`detect`:
+
+    1. Remove points out of the camera's range and mixed pixels at edges (:func:`segmentation.mixed_pixels`).
+    2. Remove points outside of the workspace, on the known surfaces (table, floor, pedestal) and on the robot
+       (:class:`SelfFilter`).
+    3. Group the rest: points that are connected by small gaps belong to one object. A clearly concave group is cut into
+       two objects that touch each other, for example a hand and a bottle (:func:`segmentation.best_cut`).
+    4. Fit a sphere, a cylinder, a capsule, a box or a convex hull to each object, with the covariance of its position,
+       and extend it to what is hidden (:func:`~imitarm.perception.shape_choice.fit_shape`).
+
+    The fitted shapes are conservative: they contain all visible points, up to twice the noise.
+
+    Args:
+        arm: the arm with its tool, whose points are removed; None: no robot is in view.
+        surfaces: known objects that are not obstacles; the points inside and near them are removed. A ``HalfSpace``
+            for a floor or a table, or any other shape, such as ``Scene.fixtures``.
+        find_table: whether to find the largest horizontal plane in each image and to remove it too.
+        workspace: lowest and highest corner of the box in which obstacles matter, in the base frame, shape (2, 3) [m].
+        depth_range: least and largest depth that the camera measures well [m].
+        noise: noise of the camera, which sets the margins; None: that of a Kinect.
+        surface_margin: distance from a surface within which points belong to it, in addition to the noise [m].
+        padding: see :class:`SelfFilter` [m].
+        stamp_uncertainty: see :class:`SelfFilter` [s].
+        voxel: edge length of the voxels in which points are averaged [m].
+        gap: largest gap between two parts of one object [m]; wider where the rays are farther apart.
+        min_points: least number of points of an object; fewer points count as noise.
+        shapes: shapes that may be fitted.
+        split: whether clearly concave groups are cut into parts.
+
+    Raises:
+        InputError: when an argument can't be used.
+    """
+
+    def __init__(
+        self,
+        arm: ArmModel | None = None,
+        *,
+        surfaces: Sequence[Obstacle] = (),
+        find_table: bool = False,
+        workspace: ArrayLike = ((-1.5, -1.5, -0.8), (1.5, 1.5, 2.0)),
+        depth_range: tuple[float, float] = (0.5, 5.0),
+        noise: DepthNoise | None = None,
+        surface_margin: float = 0.01,
+        padding: float = 0.03,
+        stamp_uncertainty: float = 0.04,
+        voxel: float = 0.012,
+        gap: float = 0.03,
+        min_points: int = 6,
+        shapes: Sequence[str] = SHAPES,
+        split: bool = True,
+    ) -> None:
+        self.arm = None if arm is None else instance(arm, ArmModel, "ObstacleDetector: arm")
+        self.surfaces = Scene(fixtures=tuple(surfaces)).fixtures
+        self.find_table = flag(find_table, "ObstacleDetector: find_table")
+        self.workspace = finite_array(workspace, (2, 3), "ObstacleDetector: workspace", "m").copy()
+        if not (self.workspace[0] < self.workspace[1]).all():
+            raise InputError("ObstacleDetector: workspace must be the lowest and the highest corner of a box [m]")
+        near, far = finite_array(depth_range, (2,), "ObstacleDetector: depth_range", "m").tolist()
+        if not 0.0 <= near < far:
+            raise InputError(f"ObstacleDetector: depth_range must increase from at least 0 [m], got {depth_range}")
+        self.depth_range = near, far
+        self.noise = DepthNoise() if noise is None else instance(noise, DepthNoise, "ObstacleDetector: noise")
+        self.surface_margin = finite_number(surface_margin, "ObstacleDetector: surface_margin", "m", at_least=0.0)
+        self.voxel = finite_number(voxel, "ObstacleDetector: voxel", "m", above=0.0)
+        self.gap = finite_number(gap, "ObstacleDetector: gap", "m", above=0.0)
+        self.min_points = whole_number(min_points, "ObstacleDetector: min_points", at_least=1)
+        self.shapes = tuple(choice(shape, SHAPES, "shape to fit") for shape in shapes)
+        if not self.shapes:
+            raise InputError("ObstacleDetector: shapes must name at least one shape")
+        self.split = flag(split, "ObstacleDetector: split")
+        self.self_filter = (
+            None if arm is None else SelfFilter(arm, padding=padding, stamp_uncertainty=stamp_uncertainty)
+        )
+
+    def record(self, stamp: float, q: ArrayLike) -> None:
+        """Remember the joint positions ``q`` (n_joints,) [rad] at ``stamp`` [s], for the images taken around then."""
+        if self.self_filter is not None:
+            self.self_filter.record(stamp, q)
+
+    def detect(self, frame: Frame, q: ArrayLike | None = None) -> list[Detection]:
+        """Return the obstacles in one image, the nearest to the camera first.
+
+        Args:
+            frame: depth image or point cloud.
+            q: joint positions when the image was taken, shape (n_joints,) [rad]; None: interpolated between the
+                positions given to :meth:`record`.
+
+        Raises:
+            InputError: when ``frame`` is neither an image nor a point cloud, ``q`` has a wrong shape, or the detector
+                has an arm whose joint positions are unknown.
+        """
+        if not isinstance(frame, DepthFrame | PointCloud):
+            raise InputError(f"detect: frame must be a DepthFrame or a PointCloud, got {frame!r}")
+        if self.self_filter is not None:
+            if q is not None:
+                self.self_filter.record(frame.stamp, q)
+            elif not self.self_filter.ready:
+                raise InputError(
+                    "detect: the joint positions of the arm are unknown, so its points can't be removed; give q, or "
+                    "call record(stamp, q) first"
+                )
+        measured, surfaces = self._obstacle_points(frame)
+        if len(measured.points) < self.min_points:
+            return []
+        space = FreeSpace(frame if isinstance(frame, DepthFrame) else None, surfaces, self.noise.sigma)
+        objects = [part for cluster in self._clusters(measured) for part in self._parts(cluster)]
+        objects.sort(key=lambda part: float(part.depth.min()))
+        return [self._detection(part, space) for part in objects]
+
+    def obstacle_points(self, frame: Frame, q: ArrayLike | None = None) -> Array:
+        """Return the points that belong neither to the robot nor to a known surface, in the base frame, (n, 3) [m].
+
+        The arguments are those of :meth:`detect`.
+        """
+        if q is not None:
+            self.record(frame.stamp, q)
+        return self._obstacle_points(frame)[0].points
+
+    def _obstacle_points(self, frame: Frame) -> tuple[_Measured, tuple[Obstacle, ...]]:
+        measured = _measured(frame, self.depth_range)
+        low, high = self.workspace
+        measured = measured.only(((measured.points >= low) & (measured.points <= high)).all(axis=1))
+        surfaces = self.surfaces
+        if self.find_table and len(measured.points):
+            plane = segmentation.fit_plane(measured.points, normal=_UP)
+            surfaces = surfaces if plane is None else (*surfaces, plane)
+        for surface in surfaces:
+            margin = self.surface_margin + 3.0 * self.noise.sigma(measured.depth)
+            measured = measured.only(surface.distances_at(measured.points, False)[0] > margin)
+        if self.self_filter is None:
+            return measured, surfaces
+        own = self.self_filter.on_arm(measured.points, frame.stamp, 2.0 * self.noise.sigma(measured.depth))
+        if measured.pixel is not None and isinstance(frame, DepthFrame) and own.any():
+            image = np.zeros(frame.depth.size, dtype=bool)
+            image[measured.pixel[own]] = True
+            beside = binary_dilation(image.reshape(frame.depth.shape), np.ones((3, 3), dtype=bool))
+            own |= beside.ravel()[measured.pixel]  # mixed pixels at the outline of the arm
+        return measured.only(~own), surfaces
+
+    def _clusters(self, measured: _Measured) -> list[_Measured]:
+        """Return the points of each object."""
+        index, n = segmentation.voxels(measured.points, self.voxel)
+        centers = segmentation.voxel_means(np.column_stack([measured.points, measured.depth]), index, n)
+        gaps = np.maximum(self.gap, _SLANTED * measured.spacing * centers[:, 3])
+        owner = segmentation.connected(centers[:, :3], gaps)[index]
+        order = np.argsort(owner, kind="stable")
+        ends = np.cumsum(np.bincount(owner))
+        groups = np.split(order, ends[:-1])
+        return [_take(measured, group) for group in groups if len(group) >= self.min_points]
+
+    def _parts(self, cluster: _Measured, parts: int = 1) -> list[_Measured]:
+        """Cut a clearly concave group in two, and each of the two again."""
+        points = cluster.points
+        if not self.split or parts >= _MOST_PARTS or len(points) < 4 * self.min_points:
+            return [cluster]
+        depth = float(np.median(cluster.depth))
+        allowed = _CLEARLY_CONCAVE + 3.0 * float(self.noise.sigma(depth))
+        sample = points[np.linspace(0, len(points) - 1, min(len(points), _MOST_VOXELS)).astype(int)]
+        before = segmentation.concavity(sample)
+        if before <= allowed:
+            return [cluster]
+        side, after = segmentation.best_cut(points, cluster.origin)
+        if after > 0.5 * before or min(side.sum(), (~side).sum()) < self.min_points:
+            return [cluster]
+        return [part for half in (side, ~side) for part in self._parts(cluster.only(half), parts + 1)]
+
+    def _detection(self, part: _Measured, space: FreeSpace) -> Detection:
+        depth = float(np.median(part.depth))
+        sigma, spacing = float(self.noise.sigma(depth)), part.spacing * depth
+        index, n = segmentation.voxels(part.points, self.voxel)
+        centers = segmentation.voxel_means(part.points, index, n)
+        if n > _MOST_VOXELS:
+            centers = centers[np.linspace(0, n - 1, _MOST_VOXELS).astype(int)]
+        visible = Visible.of(centers, part.origin, sigma, spacing)
+        return fit_shape(visible, space, self.shapes, part.points)
+
+
+def _take(measured: _Measured, group: NDArray[np.intp]) -> _Measured:
+    chosen = np.zeros(len(measured.points), dtype=bool)
+    chosen[group] = True
+    return measured.only(chosen)
+
+
+def _measured(frame: Frame, depth_range: tuple[float, float]) -> _Measured:
+    """Return the points of a frame that are in the camera's range and not mixed."""
+    near, far = depth_range
+    if isinstance(frame, PointCloud):
+        depth = np.linalg.norm(frame.measured, axis=1)
+        kept = (depth >= near) & (depth <= far)
+        measured = _Measured(frame.points(), depth, None, frame.colors, frame.sensor_to_base.position, frame.spacing)
+        return measured.only(kept)
+    with np.errstate(invalid="ignore"):
+        kept = (frame.depth >= near) & (frame.depth <= far) & ~segmentation.mixed_pixels(frame.depth)
+    pixel = np.flatnonzero(kept.ravel())
+    depth = frame.depth.ravel()[pixel]
+    points = frame.camera_to_base.apply(_rays(frame.intrinsics)[pixel] * depth[:, None])
+    colors = None if frame.color is None else frame.color.reshape(-1, 3)[pixel]
+    return _Measured(points, depth, pixel, colors, frame.camera_to_base.position, frame.spacing)
+
+
+@lru_cache(maxsize=4)
+def _rays(camera: Intrinsics) -> Array:
+    rays = camera.rays().reshape(-1, 3)
+    rays.setflags(write=False)
+    return rays

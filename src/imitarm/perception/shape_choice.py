@@ -1,0 +1,253 @@
+"""Choice of the shape that explains the visible points of an object and covers what the camera can't see."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.kinematics.pose import Pose
+from imitarm.perception import shape_fit
+from imitarm.perception.detection import Detection
+from imitarm.perception.free_space import FreeSpace
+from imitarm.perception.shape_fit import Fit, Visible
+from imitarm.scene import Box, Capsule, ConvexHull, Cylinder, Obstacle, Sphere
+
+Array = NDArray[np.float64]
+
+SHAPES = ("sphere", "cylinder", "capsule", "box", "convex_hull")
+_PARAMETERS = {"sphere": 4, "cylinder": 7, "capsule": 7, "box": 9}
+_DIRECTIONS = 64  # surface points of a shape that are compared with the free space
+_FLOATING = 0.2  # largest fraction of a shape's surface in the free space
+_RELATED = 4.0  # neighbouring points have similar errors: so many points count as one
+_GRID = np.stack(np.meshgrid([-0.9, 0.0, 0.9], [-0.9, 0.0, 0.9]), axis=-1).reshape(-1, 2)
+_MOST_GROWN = 0.3  # [m] by which an unseen side is extended at most
+
+
+def fit_shape(
+    visible: Visible, space: FreeSpace, shapes: Sequence[str] = SHAPES, every: Array | None = None
+) -> Detection:
+    r"""Fit all shapes and return the one that explains the points best, extended to what may be hidden.
+
+    Let ``s`` be the root mean square of the distances of ``n`` points to the surface of a fitted shape with ``k``
+    parameters, but at least the standard deviation of the measurement. The shape with the smallest Bayesian information
+    criterion is chosen:
+
+    .. math:: n \log s^2 + k \log n
+
+    A shape is left out if more than a fifth of its surface would stand where the camera saw nothing. If every shape
+    is left out, or the best leaves distances far above the noise, the hull of the points is used.
+
+    Then, ends and faces that the camera did not see grow until they reach space that is seen to be empty, at most by
+    the size of the visible part or 0.3 m. At last, the shape grows until it contains every visible point, up to twice
+    the standard deviation of the noise.
+
+    The covariance of the position contains the noise of the points, the distance between neighbouring rays, and the
+    uncertain size of the unseen part: a length that may be anything from 0 to ``g`` moves the centre with a standard
+    deviation of ``g / sqrt(48)``.
+
+    Args:
+        visible: points to which the shapes are fitted.
+        space: the space that the camera saw to be empty.
+        shapes: shapes that may be chosen.
+        every: all points of the object, which the result contains, shape (m, 3) [m]; None: ``visible.points``.
+    """
+    every = visible.points if every is None else every
+    n = len(visible.points)
+    if n < 8 or np.ptp(visible.points, axis=0).max() < 2.0 * visible.spacing:
+        return _ball(visible, every)
+    floor = float(np.hypot(visible.sigma, 0.002))
+    count = n / _RELATED
+    scored: list[tuple[float, float, Fit]] = []
+    for kind in (kind for kind in _PARAMETERS if kind in shapes):
+        penalty = _PARAMETERS[kind] * np.log(count)
+        least = min(scored, key=lambda entry: entry[0])[0] if scored else np.inf
+        if least <= count * np.log(floor**2) + penalty:  # no shape with more parameters can be better
+            break
+        for fit in candidates(visible, kind):
+            distances = np.abs(fit.obstacle.distances_at(visible.points, False)[0])
+            rms = float(np.sqrt(np.mean(np.minimum(distances, 10.0 * floor) ** 2)))
+            scored.append((float(count * np.log(max(rms, floor) ** 2) + penalty), rms, fit))
+    scored.sort(key=lambda entry: entry[0])
+    standing = (entry for entry in scored if _floating(entry[2].obstacle, visible, space) <= _FLOATING)
+    _, spread, best = next(standing, (np.inf, np.inf, None))
+    if best is None or ("convex_hull" in shapes and spread > 2.0 * floor + 0.004):
+        best = shape_fit.hull(visible)
+        spread = visible.spacing
+    obstacle, grown = grow(best.obstacle, visible, space)
+    noise = max(spread, visible.sigma) ** 2 * _RELATED * best.covariance
+    covariance = noise + (visible.spacing**2 / 12.0 + 1e-6) * np.eye(3) + grown
+    return Detection(contain(obstacle, every, 2.0 * visible.sigma), 0.5 * (covariance + covariance.T))
+
+
+def candidates(visible: Visible, kind: str) -> list[Fit]:
+    """Return fits of one kind of shape, one for each direction that its axis may have."""
+    if kind == "sphere":
+        fit = shape_fit.sphere(visible)
+        return [] if fit is None else [fit]
+    if kind == "box":
+        return [shape_fit.box(visible, axis) for axis in box_axes(visible)]
+    function = shape_fit.cylinders if kind == "cylinder" else shape_fit.capsules
+    return function(visible, np.array(axes(visible)))
+
+
+def axes(visible: Visible) -> list[Array]:
+    """Return directions that the axis of a cylinder or a capsule may have: across all normals, long, and upright."""
+    normals, points = visible.normals, visible.points - visible.points.mean(axis=0)
+    least = np.linalg.eigh(normals.T @ normals)[1][:, 0]
+    longest = np.linalg.eigh(points.T @ points)[1][:, 2]
+    return _distinct([least, longest, np.array([0.0, 0.0, 1.0])])
+
+
+def box_axes(visible: Visible) -> list[Array]:
+    """Return directions that an edge of a box may have: the normal that most points share, and upright."""
+    normals = visible.normals[:: max(1, len(visible.normals) // 100)]
+    alike = np.abs(normals @ normals.T) > 0.97
+    common = alike[int(alike.sum(axis=1).argmax())]
+    chosen = normals[common]
+    direction = np.linalg.eigh(chosen.T @ chosen)[1][:, 2]
+    return _distinct([direction, np.array([0.0, 0.0, 1.0])])
+
+
+def _distinct(directions: list[Array]) -> list[Array]:
+    kept: list[Array] = []
+    for direction in directions:
+        if all(abs(direction @ other) < 0.985 for other in kept):
+            kept.append(direction)
+    return kept
+
+
+def _floating(obstacle: Obstacle, visible: Visible, space: FreeSpace) -> float:
+    """Return the fraction of points on a shape that are in space that the camera saw to be empty."""
+    points = obstacle.support(_SPHERE)
+    center = obstacle.solid().position
+    return float(space.empty(center + 0.9 * (points - center), margin=0.01 + visible.spacing).mean())
+
+
+def grow(obstacle: Obstacle, visible: Visible, space: FreeSpace) -> tuple[Obstacle, Array]:
+    """Extend the faces or ends of a shape until they reach space that is seen to be empty.
+
+    Args:
+        obstacle: a fitted shape.
+        visible: the points to which it was fitted.
+        space: the space that the camera saw.
+
+    Returns:
+        The extended shape, and the covariance of its position that results from the unknown size (3, 3) [m^2].
+    """
+    if isinstance(obstacle, Box):
+        return _grow_box(obstacle, visible, space)
+    if isinstance(obstacle, Cylinder | Capsule):
+        return _grow_bar(obstacle, visible, space)
+    return obstacle, np.zeros((3, 3))
+
+
+def _steps(limit: float, visible: Visible) -> Array:
+    """Return the lengths by which a side is extended in turn [m]."""
+    return np.linspace(0.0, limit, max(2, int(limit / max(0.5 * visible.spacing, 0.005)) + 1))[1:]
+
+
+def _grow_box(box: Box, visible: Visible, space: FreeSpace) -> tuple[Obstacle, Array]:
+    rotation, half = box.pose.rotation, 0.5 * box.size
+    low, high, variance = -half.copy(), half.copy(), np.zeros(3)
+    eye = (visible.origin - box.pose.position) @ rotation
+    for j in np.argsort(-half):
+        others = [i for i in range(3) if i != j]
+        for sign in (-1.0, 1.0):
+            if sign * eye[j] > half[j]:  # a face that the camera sees is where it is seen
+                continue
+            lengths = _steps(min(_MOST_GROWN, max(2.0 * float(half.max()), 0.02)), visible)
+            face = np.empty((len(lengths), len(_GRID), 3))
+            middle, span = 0.5 * (low + high)[others], 0.5 * (high - low)[others]
+            face[:, :, others] = middle + _GRID * span
+            face[:, :, j] = ((high if sign > 0.0 else -low)[j] + lengths[:, None]) * sign
+            grown = _until_empty(box.pose.position + face @ rotation.T, lengths, space, visible)
+            if sign > 0.0:
+                high[j] += grown
+            else:
+                low[j] -= grown
+            variance[j] += grown**2 / 48.0
+    pose = Pose(box.pose.position + rotation @ (0.5 * (low + high)), box.pose.quaternion)
+    return Box(pose, high - low), rotation @ np.diag(variance) @ rotation.T
+
+
+def _grow_bar(bar: Cylinder | Capsule, visible: Visible, space: FreeSpace) -> tuple[Obstacle, Array]:
+    solid = bar.solid()
+    rotation = Pose(solid.position, solid.quaternion).rotation
+    axis = rotation[:, 2]
+    e1, e2 = rotation[:, 0], rotation[:, 1]
+    half = 0.5 * float(solid.size[1])
+    cap = bar.radius if isinstance(bar, Capsule) else 0.0
+    ends, variance = [], 0.0
+    for sign in (-1.0, 1.0):
+        grown = 0.0
+        if sign * ((visible.origin - solid.position) @ axis) <= half + cap or cap:
+            lengths = _steps(min(_MOST_GROWN, max(2.0 * half, 2.0 * bar.radius)), visible)
+            disc = 0.7 * bar.radius * (_GRID[:, :1] * e1 + _GRID[:, 1:] * e2) * (0.5 if cap else 1.0)
+            along = (half + cap + lengths)[:, None, None] * sign * axis
+            grown = _until_empty(solid.position + along + disc, lengths, space, visible)
+        ends.append(solid.position + sign * (half + grown) * axis)
+        variance += grown**2 / 48.0
+    covariance = variance * np.outer(axis, axis)
+    if isinstance(bar, Capsule):
+        return replace(bar, start=ends[0], end=ends[1]), covariance
+    middle = 0.5 * (ends[0] + ends[1])
+    length = float(np.linalg.norm(ends[1] - ends[0]))
+    return replace(bar, pose=Pose(middle, bar.pose.quaternion), length=length), covariance
+
+
+def _until_empty(samples: Array, lengths: Array, space: FreeSpace, visible: Visible) -> float:
+    """Return the length at which the first of ``samples`` (k, m, 3) is in empty space; 0 if it is at the first."""
+    empty = space.empty(samples, margin=0.005).mean(axis=1) > 0.3
+    if not empty.any():
+        return float(lengths[-1])
+    first = int(empty.argmax())
+    return float(lengths[first - 1]) if first else 0.0
+
+
+def contain(obstacle: Obstacle, points: Array, tolerance: float = 0.0) -> Obstacle:
+    """Return the shape enlarged so that it contains all points (n, 3) [m], except for ``tolerance`` [m]."""
+    slack = 1e-9
+    if isinstance(obstacle, Sphere | Capsule):
+        outside = float(obstacle.distances_at(points, False)[0].max()) - tolerance
+        return replace(obstacle, radius=obstacle.radius + max(outside, 0.0) + slack)
+    if isinstance(obstacle, Box):
+        rotation = obstacle.pose.rotation
+        local = (points - obstacle.pose.position) @ rotation
+        low = np.minimum(local.min(axis=0) + tolerance, -0.5 * obstacle.size) - slack
+        high = np.maximum(local.max(axis=0) - tolerance, 0.5 * obstacle.size) + slack
+        middle = obstacle.pose.position + rotation @ (0.5 * (low + high))
+        return replace(obstacle, pose=Pose(middle, obstacle.pose.quaternion), size=high - low)
+    if isinstance(obstacle, Cylinder):
+        rotation = obstacle.pose.rotation
+        local = (points - obstacle.pose.position) @ rotation
+        half = 0.5 * obstacle.length
+        low = min(float(local[:, 2].min()) + tolerance, -half) - slack
+        high = max(float(local[:, 2].max()) - tolerance, half) + slack
+        radius = max(obstacle.radius, float(np.hypot(local[:, 0], local[:, 1]).max()) - tolerance) + slack
+        middle = obstacle.pose.position + rotation[:, 2] * 0.5 * (low + high)
+        return replace(obstacle, pose=Pose(middle, obstacle.pose.quaternion), radius=radius, length=high - low)
+    beyond = obstacle.distances_at(points, False)[0] > tolerance + slack
+    if isinstance(obstacle, ConvexHull) and beyond.any():
+        return shape_fit.centered_hull(np.concatenate([obstacle.points, points[beyond]]))
+    return obstacle
+
+
+def _ball(visible: Visible, every: Array) -> Detection:
+    """Return a sphere around few points, which show no shape."""
+    center = 0.5 * (every.min(axis=0) + every.max(axis=0))
+    radius = float(np.linalg.norm(every - center, axis=1).max()) + visible.spacing
+    return Detection(Sphere(center, max(radius, shape_fit.THINNEST)), (radius**2 / 3.0 + visible.sigma**2) * np.eye(3))
+
+
+def _fibonacci(n: int) -> Array:
+    """Return n directions that are spread evenly over the sphere, shape (n, 3)."""
+    k = np.arange(n) + 0.5
+    z, turn = 1.0 - 2.0 * k / n, np.pi * (1.0 + np.sqrt(5.0)) * k
+    flat = np.sqrt(1.0 - z * z)
+    return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=1)
+
+
+_SPHERE = _fibonacci(_DIRECTIONS)

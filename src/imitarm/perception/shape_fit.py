@@ -1,0 +1,356 @@
+"""Fits of spheres, cylinders, capsules, boxes and hulls to the visible points of one object."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from imitarm.kinematics.pose import Pose, matrix_to_quaternion
+from imitarm.scene import Box, Capsule, ConvexHull, Cylinder, Obstacle, Sphere
+from imitarm.scene.obstacle import rotation_from_z
+
+Array = NDArray[np.float64]
+
+_ROUNDS = 8  # Gauss-Newton steps at most
+_SMALL_STEP = 2e-4  # [m] after which a fit has converged
+_LARGEST = 2.0  # [m] of a fitted radius: with a larger one, the points are as good as flat
+_NEIGHBOURS = 12  # points from which a normal is estimated
+_YAWS = np.radians(np.arange(0.0, 90.0, 5.0))
+_FINE = np.radians(np.arange(-4.0, 5.0, 1.0))
+THINNEST = 0.01  # [m] least size of a fitted shape
+
+
+class Visible(NamedTuple):
+    """The visible points of one object.
+
+    Attributes:
+        points: shape (n, 3) [m].
+        normals: outward unit normals, towards the camera, shape (n, 3).
+        origin: position of the camera, shape (3,) [m].
+        sigma: standard deviation of the points along their rays [m].
+        spacing: distance of neighbouring points on a surface that faces the camera [m].
+    """
+
+    points: Array
+    normals: Array
+    origin: Array
+    sigma: float
+    spacing: float
+
+    @classmethod
+    def of(cls, points: Array, origin: Array, sigma: float, spacing: float) -> Visible:
+        """Estimate the normals and return the points with them."""
+        return cls(points, point_normals(points, origin), origin, sigma, spacing)
+
+
+class Fit(NamedTuple):
+    """A shape fitted to visible points.
+
+    Attributes:
+        obstacle: the shape.
+        covariance: covariance of its position for residuals of one metre: the block of ``(J^T J)^-1``, shape (3, 3).
+    """
+
+    obstacle: Obstacle
+    covariance: Array
+
+
+def point_normals(points: Array, origin: Array) -> Array:
+    """Return the normal of the surface at each point, towards the camera, shape (n, 3).
+
+    The normal is the direction in which a point and its nearest neighbours vary least.
+
+    Args:
+        points: shape (n, 3) [m].
+        origin: position of the camera, shape (3,) [m].
+    """
+    k = min(_NEIGHBOURS, len(points))
+    near = points[cKDTree(points).query(points, k)[1].reshape(len(points), k)]
+    centered = near - near.mean(axis=1, keepdims=True)
+    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", centered, centered))[1][:, :, 0]
+    away = np.einsum("ij,ij->i", normals, origin - points) < 0.0
+    normals[away] *= -1.0
+    return np.asarray(normals)
+
+
+def sphere(visible: Visible) -> Fit | None:
+    """Fit a sphere: minimise the squares of ``|p - c| - r`` by Gauss-Newton, from the linear solution."""
+    points = visible.points
+    shift = points.mean(axis=0)
+    p = points - shift
+    system = np.column_stack([2.0 * p, np.ones(len(p))])
+    solution = np.linalg.lstsq(system, (p * p).sum(axis=1), rcond=None)[0]
+    center, radius = solution[:3], float(np.sqrt(max(solution[3] + solution[:3] @ solution[:3], 1e-8)))
+    for _ in range(_ROUNDS):
+        away = p - center
+        distance = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
+        jacobian = np.column_stack([-away / distance[:, None], -np.ones(len(p))])
+        steps, normal = _steps(jacobian[None], (distance - radius)[None], visible, None)
+        center, radius = center + steps[0, :3], radius + float(steps[0, 3])
+        if _converged(steps):
+            break
+    if not _usable(center, radius):
+        return None
+    return Fit(Sphere(center + shift, max(radius, 0.5 * THINNEST)), np.linalg.inv(normal[0])[:3, :3])
+
+
+def cylinders(visible: Visible, axes: Array) -> list[Fit]:
+    """Fit cylinders, starting from several directions ``axes`` (k, 3) of the axis.
+
+    Points whose normals are across the axis are on the side; they determine axis and radius. The ends are the planes
+    of points whose normals are along the axis, or the outermost points.
+    """
+    bars = _round_bars(visible, axes, np.abs(axes @ visible.normals.T) < 0.6)
+    fits = []
+    for center, axis, radius, inverse in zip(bars.centers, bars.axes, bars.radii.tolist(), bars.inverses, strict=True):
+        if not _usable(center, radius):
+            continue
+        along = (visible.points - center) @ axis
+        facing = visible.normals @ axis
+        low, high = (_end(along, facing, sign, visible) for sign in (-1.0, 1.0))
+        pose = Pose(center + 0.5 * (low + high) * axis, rotation_from_z(axis))
+        shape = Cylinder(pose, max(radius, 0.5 * THINNEST), max(high - low, THINNEST))
+        fits.append(Fit(shape, _bar_covariance(inverse, axis, 0.5 * (low + high))))
+    return fits
+
+
+def capsules(visible: Visible, axes: Array) -> list[Fit]:
+    """Fit capsules, starting from several directions ``axes`` (k, 3) of the axis.
+
+    All points are at the distance ``r`` from the segment between the two ends. The Gauss-Newton steps move the axis,
+    the radius and the two ends at once.
+    """
+    bars = _round_bars(visible, axes, np.ones((len(axes), len(visible.points)), dtype=bool), rounds=3)
+    usable = [i for i, radius in enumerate(bars.radii.tolist()) if _usable(bars.centers[i], radius)]
+    if not usable:
+        return []
+    centers, axes, radii = bars.centers[usable], bars.axes[usable], bars.radii[usable]
+    p = visible.points - centers[:, None]
+    along = np.einsum("bnk,bk->bn", p, axes)
+    radii = np.minimum(radii, 0.5 * np.maximum(np.ptp(along, axis=1), THINNEST))
+    low, high = along.min(axis=1) + radii, along.max(axis=1) - radii
+    for _ in range(_ROUNDS):
+        middle = 0.5 * (low + high)
+        low, high = np.minimum(low, middle), np.maximum(high, middle)
+        e1, e2 = _across(axes)
+        p = visible.points - centers[:, None]
+        along = np.einsum("bnk,bk->bn", p, axes)
+        nearest = np.clip(along, low[:, None], high[:, None])
+        away = p - nearest[..., None] * axes[:, None]
+        distance = np.maximum(np.sqrt(np.einsum("bnk,bnk->bn", away, away)), 1e-9)
+        away /= distance[..., None]
+        u1, u2, ua = (np.einsum("bnk,bk->bn", away, e) for e in (e1, e2, axes))
+        ends = -ua * (along < low[:, None]), -ua * (along > high[:, None])
+        jacobian = np.stack([-u1, -u2, -nearest * u1, -nearest * u2, np.full_like(u1, -1.0), *ends], axis=-1)
+        step, normal = _steps(jacobian, distance - radii[:, None], visible, None)
+        centers, axes, radii = _moved(centers, axes, radii, e1, e2, step)
+        low, high = low + step[:, 5], high + step[:, 6]
+        if _converged(step):
+            break
+    fits = []
+    for i, radius in enumerate(radii.tolist()):
+        a, b = sorted((float(low[i]), float(high[i])))
+        if _usable(centers[i], radius) and max(abs(a), abs(b)) < _LARGEST:
+            shape = Capsule(centers[i] + a * axes[i], centers[i] + b * axes[i], max(radius, 0.5 * THINNEST))
+            inverse = np.asarray(np.linalg.inv(normal[i, :5, :5]), dtype=np.float64)
+            fits.append(Fit(shape, _bar_covariance(inverse, axes[i], 0.5 * (a + b))))
+    return fits
+
+
+def box(visible: Visible, axis: Array) -> Fit:
+    """Fit a box of which one edge is parallel to ``axis`` (3,).
+
+    The rotation about the axis minimises the mean distance of the points to the nearest face that the camera can see
+    (*L-shape fitting*: Zhang, Xu, Dong and Dolan, IV 2017). A visible face is the mean of its points; the other faces
+    are at the outermost points.
+    """
+    e1, e2 = np.concatenate(_across(axis[None]))
+    local = np.column_stack([visible.points @ e1, visible.points @ e2, visible.points @ axis])
+    eye = np.array([visible.origin @ e1, visible.origin @ e2, visible.origin @ axis])
+    yaw = _best_yaw(local, eye, _YAWS)
+    yaw = _best_yaw(local, eye, yaw + _FINE)
+    c, s = np.cos(yaw), np.sin(yaw)
+    x, y = c * e1 + s * e2, c * e2 - s * e1
+    rotation = np.column_stack([x, y, axis])
+    p, eye = visible.points @ rotation, visible.origin @ rotation
+    low, high = p.min(axis=0), p.max(axis=0)
+    n = visible.normals @ rotation
+    variance = np.full((3, 2), visible.spacing**2 / 3.0 / max(visible.sigma, 1e-4) ** 2 + 1.0)
+    for j in range(3):
+        for sign, at in ((-1.0, low), (1.0, high)):
+            if (eye[j] - at[j]) * sign > 0.0:
+                close = (sign * (at[j] - p[:, j]) < 5.0 * visible.sigma + 0.004) & (sign * n[:, j] > 0.7)
+                if close.sum() >= 4:
+                    at[j] = p[close, j].mean()
+                    variance[j, int(sign > 0.0)] = 1.0 / close.sum()
+    size = np.maximum(high - low, THINNEST)
+    pose = Pose(rotation @ (0.5 * (low + high)), matrix_to_quaternion(rotation))
+    return Fit(Box(pose, size), rotation @ np.diag(0.25 * variance.sum(axis=1)) @ rotation.T)
+
+
+def hull(visible: Visible) -> Fit:
+    """Enclose the points and a mirrored copy of them behind the object, as its unseen back.
+
+    The back of a convex object begins where its outline is seen. The points are mirrored in the plane perpendicular to
+    the line of sight through the farthest points. The depth of the result is at least half of its second-largest
+    visible extent, so that a single flat face becomes a solid.
+    """
+    points = visible.points
+    sight = points.mean(axis=0) - visible.origin
+    sight = sight / np.linalg.norm(sight)
+    depth = points @ sight
+    across = points - depth[:, None] * sight
+    extents = np.linalg.svd(across - across.mean(axis=0), compute_uv=False) * 2.0 / np.sqrt(len(points))
+    plane = max(float(depth.max()), float(depth.min()) + 0.25 * float(extents[1]) * 2.0, float(depth.min()) + THINNEST)
+    back = points + (2.0 * (plane - depth))[:, None] * sight
+    spread = 0.5 * visible.spacing * _rim(across)
+    covariance = np.eye(3) / len(points) + np.outer(sight, sight)
+    return Fit(centered_hull(np.concatenate([points + spread, back + spread])), covariance)
+
+
+def centered_hull(points: Array) -> ConvexHull:
+    """Return the hull of points (n, 3) [m]; the origin of its local frame is near the centroid of its volume.
+
+    The local frame of a hull is at the mean of its points, which depends on how densely each side was seen. The corners
+    alone, with as many copies of an inner point, move it to the middle.
+    """
+    corners = ConvexHull(points).vertices
+    center = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+    n = len(corners)
+    inner = center + (center - corners.mean(axis=0)) / 3.0
+    return ConvexHull(np.concatenate([corners, np.repeat(inner[None], 3 * n, axis=0)]))
+
+
+def _rim(across: Array) -> Array:
+    """Return the direction of each point from the middle, perpendicular to the line of sight, shape (n, 3)."""
+    away = across - across.mean(axis=0)
+    return np.asarray(away / np.maximum(np.linalg.norm(away, axis=1), 1e-6)[:, None])
+
+
+class _Bars(NamedTuple):
+    """Infinite cylinders: points of their axes (k, 3), axes (k, 3), radii (k,), and inverse normal matrices (k, 5, 5).
+
+    The five parameters are two displacements across the axis, two tilts, and the radius.
+    """
+
+    centers: Array
+    axes: Array
+    radii: Array
+    inverses: Array
+
+
+def _round_bars(visible: Visible, axes: Array, chosen: NDArray[np.bool_], rounds: int = _ROUNDS) -> _Bars:
+    """Fit infinite cylinders to chosen points (k, n), starting from the directions ``axes`` (k, 3)."""
+    weights = np.where(chosen.sum(axis=1, keepdims=True) >= 8, chosen, True).astype(float)
+    k, n = weights.shape
+    centers = np.repeat(visible.points.mean(axis=0)[None], k, axis=0)
+    e1, e2 = _across(axes)
+    p = visible.points - centers[:, None]
+    x, y = np.einsum("bnk,bk->bn", p, e1), np.einsum("bnk,bk->bn", p, e2)
+    system = np.stack([2.0 * x, 2.0 * y, np.ones((k, n))], axis=-1)
+    weighted = system * weights[..., None]
+    normal = np.swapaxes(weighted, 1, 2) @ system + 1e-9 * n * np.eye(3)
+    a, b, c = np.linalg.solve(normal, np.swapaxes(weighted, 1, 2) @ (x * x + y * y)[..., None])[..., 0].T
+    radii = np.clip(np.sqrt(np.maximum(c + a * a + b * b, 1e-8)), 0.0, _LARGEST)
+    shift = np.clip(np.stack([a, b], axis=1), -_LARGEST, _LARGEST)
+    centers = centers + shift[:, :1] * e1 + shift[:, 1:] * e2
+    normal = np.tile(np.eye(5), (k, 1, 1))
+    for _ in range(rounds):
+        e1, e2 = _across(axes)
+        p = visible.points - centers[:, None]
+        along = np.einsum("bnk,bk->bn", p, axes)
+        away = p - along[..., None] * axes[:, None]
+        distance = np.maximum(np.sqrt(np.einsum("bnk,bnk->bn", away, away)), 1e-9)
+        away /= distance[..., None]
+        u1, u2 = np.einsum("bnk,bk->bn", away, e1), np.einsum("bnk,bk->bn", away, e2)
+        jacobian = np.stack([-u1, -u2, -along * u1, -along * u2, np.full_like(u1, -1.0)], axis=-1)
+        step, normal = _steps(jacobian, distance - radii[:, None], visible, weights)
+        centers, axes, radii = _moved(centers, axes, radii, e1, e2, step)
+        if _converged(step):
+            break
+    return _Bars(centers, axes, radii, np.linalg.inv(normal))
+
+
+def _moved(centers: Array, axes: Array, radii: Array, e1: Array, e2: Array, step: Array) -> tuple[Array, Array, Array]:
+    """Return centres (k, 3), axes (k, 3) and radii (k,) of bars after a Gauss-Newton step (k, 5 or more)."""
+    tilt = np.clip(step[:, 2:4], -0.3, 0.3)
+    centers = centers + step[:, :1] * e1 + step[:, 1:2] * e2
+    tilted = axes + tilt[:, :1] * e1 + tilt[:, 1:] * e2
+    return centers, tilted / np.sqrt(np.einsum("bk,bk->b", tilted, tilted))[:, None], np.abs(radii + step[:, 4])
+
+
+def _end(along: Array, facing: Array, sign: float, visible: Visible) -> float:
+    """Return where a cylinder ends along its axis: the mean of the points of its flat end, or the outermost point."""
+    last = float((sign * along).max())
+    flat = (sign * facing > 0.8) & (sign * along > last - 5.0 * visible.sigma - 0.004)
+    return float(along[flat].mean()) if flat.sum() >= 5 else sign * last
+
+
+def _bar_covariance(inverse: Array, axis: Array, middle: float) -> Array:
+    """Return the covariance of the middle of a bar for residuals of one metre, shape (3, 3)."""
+    to_middle = np.array([[1.0, 0.0, middle, 0.0, 0.0], [0.0, 1.0, 0.0, middle, 0.0]])
+    across = to_middle @ inverse @ to_middle.T
+    basis = np.concatenate(_across(axis[None]))
+    return np.asarray(basis.T @ across @ basis + np.outer(axis, axis))
+
+
+def _best_yaw(local: Array, eye: Array, yaws: Array) -> float:
+    """Return the angle about z at which the points are nearest to the visible faces of a box around them."""
+    c, s = np.cos(yaws)[:, None], np.sin(yaws)[:, None]
+    x, y = c * local[:, 0] + s * local[:, 1], c * local[:, 1] - s * local[:, 0]
+    eyes = (c * eye[0] + s * eye[1])[:, 0], (c * eye[1] - s * eye[0])[:, 0]
+    z = np.broadcast_to(local[:, 2], x.shape)
+    nearest = np.full(x.shape, np.inf)
+    for values, own in ((x, eyes[0]), (y, eyes[1]), (z, np.full(len(yaws), eye[2]))):
+        low, high = values.min(axis=1), values.max(axis=1)
+        for face, visible in ((low, own < low), (high, own > high)):
+            gap = np.where(visible[:, None], np.abs(values - face[:, None]), np.inf)
+            nearest = np.minimum(nearest, gap)
+    cost = np.where(np.isfinite(nearest), nearest, 1.0).mean(axis=1)
+    return float(yaws[int(cost.argmin())])
+
+
+def _across(axes: Array) -> tuple[Array, Array]:
+    """Return two unit vectors (k, 3) that are perpendicular to each of ``axes`` (k, 3) and to each other.
+
+    The formula is from Duff et al., *Building an orthonormal basis, revisited*, JCGT 2017.
+    """
+    x, y, z = axes.T
+    sign = np.where(z < 0.0, -1.0, 1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    first = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x], axis=-1)
+    return first, np.stack([b, sign + y * y * a, -y], axis=-1)
+
+
+def _steps(jacobian: Array, residual: Array, visible: Visible, weights: Array | None) -> tuple[Array, Array]:
+    """Return Gauss-Newton steps (k, m), with weights that limit the effect of outliers (Huber), and normal matrices.
+
+    Args:
+        jacobian: shape (k, n, m).
+        residual: shape (k, n) [m].
+        visible: points that were fitted.
+        weights: additional weight of each residual, shape (k, n); None: 1.
+    """
+    limit = 2.0 * max(visible.sigma, 0.002)
+    weight = limit / np.maximum(np.abs(residual), limit)
+    if weights is not None:
+        weight *= weights
+    transposed = np.swapaxes(jacobian * weight[..., None], 1, 2)
+    normal = transposed @ jacobian
+    diagonal = np.einsum("bii->bi", normal)
+    diagonal += 1e-6 * np.maximum(diagonal.sum(axis=1, keepdims=True), 1e-9)
+    step = -np.linalg.solve(normal, transposed @ residual[..., None])[..., 0]
+    longest = np.abs(step).max(axis=1, keepdims=True)
+    return step * (0.3 / np.maximum(longest, 0.3)), normal
+
+
+def _converged(step: Array) -> bool:
+    return float(np.abs(step).max()) < _SMALL_STEP
+
+
+def _usable(center: Array, radius: float) -> bool:
+    return bool(np.isfinite(center).all() and 0.0 < radius < _LARGEST)
