@@ -8,7 +8,7 @@ import pytest
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_multiply
-from imitarm.perception import Intrinsics
+from imitarm.perception import DepthNoise, Intrinsics
 from imitarm.robots import SimulatedRobot
 from imitarm.robots.depth_camera import DepthCamera
 from imitarm.scene import Box, Capsule, ConvexHull, Cylinder, Ellipsoid, Scene, Sphere
@@ -103,3 +103,23 @@ def test_bad_arguments_are_refused(arm):
         good = {"robot": robot, "intrinsics": CAMERA, "pose": Pose.identity()}
         with pytest.raises(InputError, match=next(iter(change))):
             DepthCamera(**{**good, **change})
+
+
+def test_range_noise_and_colour(arm):
+    scene = Scene(None, [Sphere([2.0, 0.0, 0.4], 0.1), Sphere([3.0, 0.4, 0.4], 0.1)])
+    robot = SimulatedRobot(arm, scene=scene)
+    pose = Pose([1.0, 0.0, 0.4], LOOKS_ALONG_X)
+    exact = DepthCamera(robot, CAMERA, pose, color=True).frame()
+    near = DepthCamera(robot, CAMERA, pose, nearest=0.5, farthest=1.5).frame()
+    assert np.nanmax(near.depth) <= 1.5
+    both = ~np.isnan(near.depth)
+    np.testing.assert_array_equal(near.depth[both], exact.depth[both])
+    assert np.isnan(DepthCamera(robot, CAMERA, pose, nearest=1.2, farthest=1.5).frame().depth).all()
+    noisy = [DepthCamera(robot, CAMERA, pose, noise=DepthNoise(), seed=seed).frame().depth for seed in (1, 1, 2)]
+    np.testing.assert_array_equal(noisy[0], noisy[1])
+    assert not np.array_equal(noisy[0], noisy[2], equal_nan=True)
+    assert 0.0 < np.nanmax(np.abs(noisy[0] - exact.depth)[exact.depth < 2.0]) < 0.1
+    colours = [exact.color[exact.depth < limit] for limit in (1.2, 2.2)]
+    assert len(np.unique(colours[0], axis=0)) == 1  # the near ball alone
+    assert len(np.unique(colours[1], axis=0)) >= 2
+    assert near.color is None

@@ -1,6 +1,7 @@
 """The control loop: reproduce a skill on a robot, and what is known of its surroundings."""
 
+from imitarm.control_loop.camera_observer import CameraObserver
 from imitarm.control_loop.observer import SensorModel, TrackedScene
 from imitarm.control_loop.reproduce import Step, reproduce
 
-__all__ = ["SensorModel", "Step", "TrackedScene", "reproduce"]
+__all__ = ["CameraObserver", "SensorModel", "Step", "TrackedScene", "reproduce"]

@@ -81,6 +81,7 @@ class ObstacleDetector:
         min_points: least number of points of an object; fewer points count as noise.
         shapes: shapes that may be fitted.
         split: whether clearly concave groups are cut into parts.
+        max_obstacles: largest number of detections; of more, those that are nearest to the camera are kept.
 
     Raises:
         InputError: when an argument can't be used.
@@ -103,6 +104,7 @@ class ObstacleDetector:
         min_points: int = 6,
         shapes: Sequence[str] = SHAPES,
         split: bool = True,
+        max_obstacles: int = 32,
     ) -> None:
         self.arm = None if arm is None else instance(arm, ArmModel, "ObstacleDetector: arm")
         self.surfaces = Scene(fixtures=tuple(surfaces)).fixtures
@@ -123,6 +125,7 @@ class ObstacleDetector:
         if not self.shapes:
             raise InputError("ObstacleDetector: shapes must name at least one shape")
         self.split = flag(split, "ObstacleDetector: split")
+        self.max_obstacles = whole_number(max_obstacles, "ObstacleDetector: max_obstacles", at_least=1)
         self.self_filter = (
             None if arm is None else SelfFilter(arm, padding=padding, stamp_uncertainty=stamp_uncertainty)
         )
@@ -160,7 +163,7 @@ class ObstacleDetector:
         space = FreeSpace(frame if isinstance(frame, DepthFrame) else None, surfaces, self.noise.sigma)
         objects = [part for cluster in self._clusters(measured) for part in self._parts(cluster)]
         objects.sort(key=lambda part: float(part.depth.min()))
-        return [self._detection(part, space) for part in objects]
+        return [self._detection(part, space) for part in objects[: self.max_obstacles]]
 
     def obstacle_points(self, frame: Frame, q: ArrayLike | None = None) -> Array:
         """Return the points that belong neither to the robot nor to a known surface, in the base frame, (n, 3) [m].

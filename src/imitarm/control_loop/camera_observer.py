@@ -1,0 +1,155 @@
+"""CameraObserver: cameras, an obstacle detector and a tracker as the ``observe`` of a control loop."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from imitarm.control_loop.observer import Tracker
+from imitarm.errors import InputError
+from imitarm.kinematics.pose import Pose
+from imitarm.perception import DepthFrame, ObstacleDetector, PointCloud
+from imitarm.scene import Obstacle, Scene
+from imitarm.validation import finite_number, function, instance
+
+Frame = DepthFrame | PointCloud
+
+_ROUNDING = 1e-9  # [s]
+
+
+class _Waiting(NamedTuple):
+    """An image on its way: when it arrives [s], and what it is."""
+
+    arrival: float
+    frame: Frame
+
+
+class CameraObserver:
+    """The scene as cameras and a tracker know it; callable as ``observe(t)``.
+
+    At each period of the cameras, every camera takes an image. An image arrives after the latency: then the detector
+    finds the obstacles in it, and the tracker takes them in with the time stamp of the image. ``observe(t)`` returns
+    the tracks, predicted to ``t``. A camera may be fixed or on the wrist, because each image contains its own pose. The
+    joint positions are recorded at every call, so that the detector can remove the arm from each image where it was
+    when the image was taken.
+
+    **A frozen camera.** An image whose stamp is not newer than the one before is ignored. If the newest image is older
+    than ``max_age``, the scene is no longer predicted: its ``stamp`` stays that of the newest image, so that a watchdog
+    can see how old it is. Before the first image, the scene is empty and its stamp is that of the first call.
+
+    Calls must be in the order of time, as a camera can't take images of the past.
+
+    Args:
+        cameras: one function or several functions that return a new image, or None if there is none, for example
+            ``DepthCamera.frame``.
+        detector: finds the obstacles.
+        tracker: an :class:`~imitarm.perception.ObstacleTracker`.
+        joints: function that returns the current joint positions (n_joints,) [rad]; required if the detector removes an
+            arm.
+        rate: images per second of each camera [Hz].
+        latency: time from the exposure to the arrival of an image [s].
+        max_age: age of the newest image at which the cameras count as frozen [s].
+        clock: what the stamps of the images are ahead of the times of the calls [s], for example the stamp of the scene
+            in which a simulated robot started.
+        goal: goal of the scenes.
+        fixtures: fixtures of the scenes.
+
+    Attributes:
+        n_frames: number of images that were used.
+
+    Raises:
+        InputError: when an argument can't be used.
+    """
+
+    def __init__(
+        self,
+        cameras: Callable[[], Frame | None] | Sequence[Callable[[], Frame | None]],
+        detector: ObstacleDetector,
+        tracker: Tracker,
+        *,
+        joints: Callable[[], ArrayLike] | None = None,
+        rate: float = 30.0,
+        latency: float = 0.033,
+        max_age: float = 0.25,
+        clock: float = 0.0,
+        goal: Pose | None = None,
+        fixtures: Sequence[Obstacle] = (),
+    ) -> None:
+        name = type(self).__name__
+        several = tuple(cameras) if isinstance(cameras, Sequence) else (cameras,)
+        self._cameras = tuple(function(camera, f"{name}: camera") for camera in several)
+        if not self._cameras:
+            raise InputError(f"{name}: cameras must contain at least one camera")
+        self.detector = instance(detector, ObstacleDetector, f"{name}: detector")
+        if joints is None and detector.arm is not None:
+            raise InputError(f"{name}: joints is required, because the detector removes the arm from the images")
+        self._joints = None if joints is None else function(joints, f"{name}: joints")
+        self.tracker = tracker
+        self.rate = finite_number(rate, f"{name}: rate", "Hz", above=0.0)
+        self.latency = finite_number(latency, f"{name}: latency", "s", at_least=0.0)
+        self.max_age = finite_number(max_age, f"{name}: max_age", "s", above=self.latency)
+        self.clock = finite_number(clock, f"{name}: clock", "s")
+        self._goal, self._fixtures = goal, tuple(fixtures)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all images, tracks and joint positions."""
+        self.tracker.reset()
+        if self.detector.self_filter is not None:
+            self.detector.self_filter.reset()
+        self.n_frames = 0
+        self._waiting: deque[_Waiting] = deque()
+        self._taken = [-math.inf] * len(self._cameras)  # stamp of the newest image of each camera
+        self._next, self._now = -math.inf, -math.inf
+        self._stamp: float | None = None
+
+    @property
+    def stamp(self) -> float | None:
+        """Time of the newest image that was used, on the clock of the calls [s]; None before the first one."""
+        return self._stamp
+
+    def __call__(self, time: float) -> Scene:
+        """Return the scene at ``time`` [s], from the images that have arrived until then.
+
+        Raises:
+            InputError: when ``time`` is not a finite number, or is earlier than in the last call.
+        """
+        time = finite_number(time, "CameraObserver: time", "s")
+        if time < self._now:
+            raise InputError(
+                f"CameraObserver: time {time:g} s is before the last call ({self._now:g} s); a camera can't look back. "
+                "Call reset() before a new run"
+            )
+        self._now = time
+        if self._joints is not None:
+            self.detector.record(time + self.clock, self._joints())
+        if time >= self._next - _ROUNDING:
+            self._take(time)
+        while self._waiting and self._waiting[0].arrival <= time + _ROUNDING:
+            self._use(self._waiting.popleft().frame)
+        fresh = self._stamp is None or time - self._stamp <= self.max_age
+        at = time if fresh or self._stamp is None else self._stamp
+        return self.tracker.scene(at, goal=self._goal, fixtures=self._fixtures)
+
+    def _take(self, time: float) -> None:
+        """Let every camera take an image, and plan the next."""
+        start = time if math.isinf(self._next) else self._next
+        periods = np.floor((time - start) * self.rate + _ROUNDING) + 1.0
+        self._next = start + float(periods) / self.rate
+        for i, camera in enumerate(self._cameras):
+            frame = camera()
+            if frame is not None and frame.stamp > self._taken[i]:
+                self._taken[i] = frame.stamp
+                self._waiting.append(_Waiting(time + self.latency, frame))
+
+    def _use(self, frame: Frame) -> None:
+        """Find the obstacles in an image that has arrived, and give them to the tracker."""
+        stamp = frame.stamp - self.clock
+        self.tracker.update(stamp, self.detector.detect(frame))
+        self._stamp = stamp if self._stamp is None else max(stamp, self._stamp)
+        self.n_frames += 1
