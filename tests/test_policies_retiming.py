@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from imitarm import ArmModel
-from imitarm.policies.retiming import retimed
+from imitarm import ArmModel, Sphere
+from imitarm.kinematics.arm_path import ArmPath, track
+from imitarm.policies.arm_certificate import ArmAmongObstacles
+from imitarm.policies.retiming import retimed, safe_rates
 
 ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
 
@@ -79,3 +81,25 @@ def test_an_arm_that_cannot_carry_its_weight_is_told_with_the_joint(tmp_path):
     timing = retimed(arm, np.linspace([0.5 * np.pi], [0.0], 50), np.linspace(0.0, 5.0, 50), np.ones(50))
     assert timing.blocked > 0
     assert timing.joint == 0
+
+
+def test_the_tool_is_as_slow_in_every_posture_and_the_whole_arm_is_no_faster():
+    arm, times = ARMS["panda"], np.linspace(0.0, 2.0, 100)
+    pose = arm.tool_pose(arm.home)
+    positions = pose.position + 0.2 * np.sin(0.5 * np.pi * times)[:, None] * [0.0, 1.0, 0.0]
+    quaternions = np.tile(pose.quaternion, (100, 1))
+    ahead = Sphere(positions[50] + [0.0, 0.08, -0.02], 0.02)
+    around = ArmAmongObstacles(arm, [ahead], 0.0)
+    rates = []
+    for drift in (None, arm.home + [0.3, 0.0, -0.5, 0.0, 0.3, 0.0, 0.0]):
+        joints = track(arm, arm.home, positions, quaternions, drift)
+        path, error = ArmPath.of(arm, joints).moved_to(positions, quaternions)
+        assert error < 1e-5
+        whole = safe_rates(around, path, times, times, 0.0)
+        tool = safe_rates(around, path, times, times, 0.0, tool_only=True)
+        assert (whole <= tool).all()
+        rates.append((tool, path.joints))
+    (first, a), (second, b) = rates
+    assert np.abs(a - b).max() > 0.1
+    assert first.min() < 0.8  # the sphere slows the tool
+    np.testing.assert_allclose(first[2:-2], second[2:-2], rtol=0.05)  # speeds are differences of samples

@@ -28,7 +28,7 @@ from imitarm.control_loop import reproduce
 from imitarm.demonstrations import align, read
 from imitarm.kinematics.arm import ArmState
 from imitarm.kinematics.pose import quaternion_conjugate, quaternion_log, quaternion_multiply
-from imitarm.policies import adapt
+from imitarm.policies import adapt, whole_arm
 from imitarm.policies.component_path import ComponentPath
 from imitarm.policies.policy import Observation
 from imitarm.safety import SafetyFilter
@@ -304,3 +304,22 @@ def test_narrow_scenes_that_were_refused_are_solved(real_data, name, seed):
     assert measured_clearance(arm, scene, plan.joints) >= 0.02
     approach = 0.0 if plan.approach is None else plan.approach.times[-1]
     assert approach + plan.trajectory.duration <= 1.5 * skill.duration_
+
+
+def test_where_the_tool_itself_is_too_slow_only_other_paths_of_the_tool_are_tried(real_data, monkeypatch):
+    """Other postures can't help, so none are looked for: the time is for paths farther from the obstacle."""
+    quick = Skill(8).fit(align(read(real_data / "panda_kinesthetic" / "pouring.npy", units="cm", duration=4.0)))
+    arm, durations = ARMS["sawyer"], []
+    start = find_posture(arm, quick.start_)
+    is_late = whole_arm._Search._tool_is_late
+
+    def noted(search, path, clock):
+        durations.append(clock[-1])
+        return is_late(search, path, clock)
+
+    monkeypatch.setattr(whole_arm._Search, "_tool_is_late", noted)
+    monkeypatch.setattr(whole_arm, "clear_postures", lambda *_: pytest.fail("no other posture is needed"))
+    plan = adapt(quick, placement(quick, arm, 8, start), arm=arm, state=at_rest(start), max_tilt=TILT)
+    assert plan.feasible
+    assert durations
+    assert plan.trajectory.duration < durations[0] - 0.1

@@ -95,7 +95,9 @@ def retimed(
     return Timing(np.concatenate([[0.0], np.cumsum(np.diff(parameters) / means)]))
 
 
-def safe_rates(around: ArmAmongObstacles, path: ArmPath, times: Array, clock: Array, allowance: float) -> Array:
+def safe_rates(
+    around: ArmAmongObstacles, path: ArmPath, times: Array, clock: Array, allowance: float, *, tool_only: bool = False
+) -> Array:
     """Return the largest rate ds/dt at each sample at which no distance shrinks faster than the safety filter allows.
 
     The safety filter measures distances to where the obstacles are predicted, so margins are left out. An obstacle that
@@ -108,6 +110,8 @@ def safe_rates(around: ArmAmongObstacles, path: ArmPath, times: Array, clock: Ar
         times: path parameter s of each sample, increasing, shape (n,) [s].
         clock: time at which each sample is compared with the places of the obstacles, shape (n,) [s].
         allowance: required clearance minus the clearance that the safety filter keeps [m].
+        tool_only: whether only the distances between the last link with its tool and obstacles count. They are the
+            same in every posture in which the tool is at the same pose.
 
     Returns:
         Shape (n,), at most 1.
@@ -122,7 +126,8 @@ def safe_rates(around: ArmAmongObstacles, path: ArmPath, times: Array, clock: Ar
     allowed = np.maximum(rate * (np.maximum(gaps.room, 0.0) + margin) + np.maximum(drift, 0.0), _CREEP)
     approach = np.maximum(-np.einsum("kj,kj->k", rates, velocity[gaps.sample]), 1e-9)
     fastest = np.ones(len(path))
-    np.minimum.at(fastest, gaps.sample, allowed / approach)
+    counts = ~own & (path.arm.cover.links[gaps.sphere] == path.arm.n_joints) if tool_only else slice(None)
+    np.minimum.at(fastest, gaps.sample[counts], (allowed / approach)[counts])
     return fastest
 
 

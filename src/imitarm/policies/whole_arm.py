@@ -10,6 +10,7 @@ The search makes the following attempts in turn. Each attempt keeps more of the 
 6. the best failed attempts again, with narrower components.
 
 If a plan takes much longer than the learned motion, a few more attempts are made, and the shortest plan is returned.
+If no other posture helps, because the tool itself passes an obstacle slowly, only other paths of the tool are tried.
 If no attempt succeeds, the reason states which link and obstacle come too close in the best attempt, and when.
 """
 
@@ -187,6 +188,7 @@ class _Search:
         self._moving = growing or any(obstacle.velocity.any() for obstacle in task.scene.obstacles)
         self._first: _Attempt | None = None
         self._worst: ArmClearance | None = None
+        self._slow_tool = False
         self._failed: list[tuple[ArmPlanner, ArmPlan]] = []
         self._goals: GoalSearch | None = None
         self.mistimed = False  # whether a plan was clear at the learned times, but not at times within the limits
@@ -203,6 +205,9 @@ class _Search:
         self._first = begin
         yield begin
         path = self._components.nominal
+        if self._slow_tool:
+            yield from self._other_paths(learned, detour)
+            return
         goal, end = Pose(path.positions[-1], self._quaternions[-1]), float(self._times[-1])
         self._goals = clear_postures(self._around, goal, end, self.task.start, self.task.goal_tilt)
         if not self._goals.found:
@@ -218,12 +223,17 @@ class _Search:
                 yield from self._other_starts(detour, far)
                 yield from self._nearly()
                 return
-        narrow = self._planner(self._components.divided, smoothness=SMOOTHNESS)
-        yield self._followed(narrow, self._narrowed(narrow, detour, learned.components))
-        for planner in (learned, narrow):
-            yield from self._sides(planner)
+        yield from self._other_paths(learned, detour)
         yield from self._other_starts(detour, self._goals.found)
         yield from self._nearly()
+
+    def _other_paths(self, learned: ArmPlanner, detour: Array) -> Iterator[_Attempt]:
+        """Yield first guesses with narrower components, and on other sides of the obstacle."""
+        narrow = self._planner(self._components.divided, smoothness=SMOOTHNESS)
+        if not (self._slow_tool and narrow.components.n_components == learned.components.n_components):
+            yield self._followed(narrow, self._narrowed(narrow, detour, learned.components))
+        for planner in (learned, narrow):
+            yield from self._sides(planner)
 
     def _nearly(self) -> Iterator[_Attempt]:
         """Yield the best failed attempts again, with narrower components."""
@@ -270,6 +280,14 @@ class _Search:
         if self._worst is None and found.plan is not None and found.timing is not None:
             slowest = int(np.argmax(np.diff(found.timing.times) / np.diff(self._times)))
             self._worst = replace(found.plan.clearance, room=-np.inf, sample=slowest)
+            detoured = np.array_equal(found.plan.displacement, self._displacement) and not found.plan.tilt.any()
+            self._slow_tool = detoured and self._tool_is_late(found.plan.path, found.timing.times)
+
+    def _tool_is_late(self, path: ArmPath, clock: Array) -> bool:
+        """Return whether a motion takes too long in any posture, because the tool passes an obstacle so slowly."""
+        rates = safe_rates(self._around, path, self._times, clock, self.task.allowance, tool_only=True)
+        least = float(np.sum(2.0 * np.diff(self._times) / (rates[1:] + rates[:-1])))
+        return least > _LATE * self._components.nominal.duration
 
     def failed(self, planner: ArmPlanner, plan: ArmPlan) -> None:
         """Remember where an attempt failed."""
