@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,12 @@ from imitarm.cli.outputs import check_outputs
 from imitarm.cli.robot_options import add_robot_options, load_robot, robot_files
 from imitarm.cli.run_scene import provenance, run_scene, show_results
 from imitarm.cli.screen import progress_bar, remark, say
+from imitarm.control_loop.observer import SensorModel, TrackedScene
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_kinematics import find_posture
 from imitarm.kinematics.pose import Pose
+from imitarm.perception import ObstacleTracker
 from imitarm.policies import ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN, POLICIES, Policy
 from imitarm.robots import SimulatedRobot
 from imitarm.scene import MovingScene, Scene, load_moving_scene, standard_fixtures
@@ -34,6 +36,7 @@ examples:
   imitarm reproduce pour.json --robot panda --tool gripper --scene bottles.yaml --report pour.html
   imitarm reproduce left.json --alternative right.json --robot panda --scene bottles.yaml
   imitarm reproduce pour.json --robot panda --scene bottles.yaml --clearance 30 --goal 40 -30 25
+  imitarm reproduce pour.json --robot panda --scene moving.yaml --policy rcamo --sensor 5 30 33
 
 The arm is simulated with its inertias and limits.
 The simulator measures the clearance between its own shapes of the arm and of the obstacles.
@@ -49,6 +52,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_robot_options(parser)
     parser.add_argument(
         "--scene", type=Path, metavar="FILE", help="file of obstacles and goal (YAML); default: no obstacles"
+    )
+    parser.add_argument(
+        "--sensor",
+        nargs=3,
+        type=float,
+        metavar=("MM", "HZ", "MS"),
+        help="observe the obstacles with a sensor and a tracker: standard deviation of the measured positions, frames "
+        "per second, latency; default: true positions and velocities without delay",
     )
     avoid = parser.add_argument_group("avoidance")
     avoid.add_argument(
@@ -151,7 +162,7 @@ def run(arguments: argparse.Namespace) -> int:
             clearance=1e-3 * arguments.clearance,
             link_clearance=None if arguments.tool_only else 1e-3 * arguments.clearance,
             tool_spheres=spheres,
-            observe=MovingScene(scene, motion).at if motion else None,
+            observe=_observer(arguments.sensor, MovingScene(scene, tracked.motions)),
             progress=lambda share: progress.update(moving, completed=share),
         )
     report = Report(title=f"{skill.task_ or 'A skill'} on {arm.name}", scenes=[result], provenance=provenance())
@@ -165,6 +176,19 @@ def run(arguments: argparse.Namespace) -> int:
         say(f"wrote {write_report(report, arguments.report)}")
     show_results(report)
     return 0 if report.passed else 1
+
+
+def _observer(sensor: Sequence[float] | None, truth: MovingScene) -> Callable[[float], Scene] | None:
+    """Return the function by which the policy observes the scene; None: the scene at the start and its velocities."""
+    if sensor is None:
+        return truth.at if truth.motions else None
+    noise, rate, latency = sensor
+    try:
+        model = SensorModel(noise=1e-3 * noise, rate=rate, latency=1e-3 * latency)
+    except InputError as error:
+        raise InputError(f"--sensor: {error}") from error
+    scene = truth.scene
+    return TrackedScene(truth, model, ObstacleTracker(), goal=scene.goal, fixtures=scene.fixtures)
 
 
 def _policy(arguments: argparse.Namespace, skill: Skill, arm: ArmModel, spheres: NDArray[np.float64]) -> Policy:
