@@ -5,7 +5,10 @@ import numpy as np
 import pytest
 
 from imitarm.errors import InputError
+from imitarm.kinematics.pose import Pose
+from imitarm.scene import Box, Scene, Sphere
 from imitarm.viewer import FrameRecorder, Recording
+from imitarm.viewer.recording import AHEAD
 from viewer_samples import make_recording, world_xml
 
 
@@ -44,3 +47,23 @@ def test_bad_input_is_named() -> None:
         Recording(good.model, good.times, good.positions[:, 1:], good.quaternions)
     with pytest.raises(InputError, match="Recording quaternions: needs finite"):
         Recording(good.model, good.times, good.positions, good.quaternions * np.nan)
+
+
+def test_predictions_of_tracked_obstacles_are_recorded_frame_by_frame() -> None:
+    model = mujoco.MjModel.from_xml_string(world_xml())
+    data, recorder = mujoco.MjData(model), FrameRecorder(model, rate=10.0)
+    mujoco.mj_kinematics(model, data)
+    known = Box(Pose.identity(), [0.2, 0.1, 0.3], name="known without a tracker")
+    recorder.note(data, 0.0)
+    for k in range(1, 4):
+        ball = Sphere([0.1 * k, 0, 0.5], 0.1, velocity=[1, 0, 0], covariance=1e-4 * k * np.eye(3), track_id=7)
+        recorder.note(data, 0.1 * k, scene=Scene(None, [known, ball] if k < 3 else [known], stamp=0.1 * k))
+    (prediction,) = recorder.recording().predictions
+    assert prediction.name == "sphere 1"
+    assert np.isnan(prediction.positions[[0, 3]]).all()
+    np.testing.assert_allclose(prediction.positions[[1, 2], 0], np.array([0.1, 0.2]) + AHEAD)
+    np.testing.assert_allclose(prediction.covariances[2], 2e-4 * np.eye(3))
+    np.testing.assert_allclose(prediction.extent, 0.1)
+    whole = recorder.recording()
+    with pytest.raises(InputError, match="sphere 1 has 4 positions for 3 frames"):
+        Recording(model, whole.times[1:], whole.positions[1:], whole.quaternions[1:], whole.predictions)

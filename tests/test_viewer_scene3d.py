@@ -5,6 +5,7 @@ import re
 import socket
 import sys
 import threading
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -14,6 +15,7 @@ import zstandard
 
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.viewer import Camera, ComponentMark, PathMark, playback_html
+from imitarm.viewer.recording import Prediction
 from viewer_samples import make_path, make_recording
 
 
@@ -65,6 +67,24 @@ def test_bodies_paths_and_components_are_drawn(page: str) -> None:
     ]
     assert len(meshes) == 2 * 7 + 1 + 6  # links and joints, brush, furniture and obstacles; the crumbs are a batch
     assert not any(red == blue and green == 0 for red, green, blue in meshes)  # the collision geoms are magenta
+
+
+def test_predicted_obstacles_are_drawn_while_they_are_tracked() -> None:
+    recording = make_recording(seconds=0.4)
+    n = len(recording)
+    positions = np.linspace([0.0, 0.0, 0.5], [0.5, 0.0, 0.5], n)
+    positions[:2] = np.nan
+    covariances = np.linspace(1e-4, 4e-4, n)[:, None, None] * np.eye(3)
+    ball = Prediction("ball", positions, covariances, np.full(3, 0.1))
+    _, played = messages(playback_html(replace(recording, predictions=(ball,))))
+    node = next(m for _, m in played if m.get("name") == "/predictions/0 ball" and "props" in m)
+    np.testing.assert_allclose(node["props"]["scale"], 0.1 + np.sqrt(7.815e-4), atol=1e-3)
+    about = [(t, m) for t, m in played if m.get("name") == "/predictions/0 ball"]
+    shown = [(t, m["visible"]) for t, m in about if m["type"] == "SetSceneNodeVisibilityMessage"]
+    assert shown[-1][1] and shown[-1][0] == pytest.approx(recording.times[2])
+    assert len({t for t, m in about if m["type"] == "SetPositionMessage"}) >= n - 3
+    scales = [m["updates"]["scale"] for _, m in about if m["type"] == "SceneNodeUpdateMessage"]
+    np.testing.assert_allclose(scales[-1], 0.1 + np.sqrt(7.815 * 4e-4), atol=1e-3)
 
 
 def test_the_page_asks_nothing_of_the_network(page: str) -> None:

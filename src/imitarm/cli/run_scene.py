@@ -78,7 +78,7 @@ def run_scene(
     phases: list[float] = []
 
     def on_step(step: Step) -> None:
-        frames.note(robot.data)
+        frames.note(robot.data, scene=step.scene)
         done = step.command.progress
         phases.append(done * policy.skill.duration_)
         if progress is not None and np.isfinite(done):

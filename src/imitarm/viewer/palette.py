@@ -15,6 +15,7 @@ DEMONSTRATION: Final = "#cc79a7"  # a demonstration
 UNMOVED: Final = "#009e73"  # a Gaussian component that was not moved
 MOVED: Final = "#d55e00"  # a Gaussian component that was moved
 OBSTACLE: Final = "#7d6b60"
+PREDICTED: Final = "#56b4e9"  # where a tracker expects an obstacle
 LIMIT: Final = "#b3261e"  # a limit or a required clearance
 
 

@@ -1,4 +1,7 @@
-"""Recording of a simulation for the 3-D playback: the poses of all bodies at a fixed rate."""
+"""Recording of a simulation for the 3-D playback: the poses of all bodies, and what a tracker predicted.
+
+:class:`FrameRecorder` notes both at a fixed rate while the simulation runs.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.errors import InputError
+from imitarm.scene import Scene
 
 Array = NDArray[np.float64]
+
+AHEAD = 0.3
+"""Time from an observation to the prediction that is drawn [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Where a tracker expected one obstacle to be after :data:`AHEAD`, frame by frame.
+
+    Attributes:
+        name: name of the obstacle in the observed scenes.
+        positions: predicted positions of its local frame, shape (n_frames, 3) [m]; nan in frames without the obstacle.
+        covariances: covariances of its position, shape (n_frames, 3, 3) [m^2].
+        extent: half extents of the obstacle along the axes of the base frame, shape (3,) [m].
+    """
+
+    name: str
+    positions: Array
+    covariances: Array
+    extent: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,6 +46,7 @@ class Recording:
         times: times of the frames, strictly increasing, shape (n_frames,) [s].
         positions: body positions in the world frame, shape (n_frames, n_bodies, 3) [m].
         quaternions: body rotations wxyz in the world frame, shape (n_frames, n_bodies, 4).
+        predictions: predictions of the tracked obstacles, each with n_frames positions.
 
     Raises:
         InputError: when shapes disagree, a number is not finite or the times do not increase.
@@ -31,6 +56,7 @@ class Recording:
     times: Array
     positions: Array
     quaternions: Array
+    predictions: tuple[Prediction, ...] = ()
 
     def __post_init__(self) -> None:
         n, bodies = len(np.atleast_1d(self.times)), self.model.nbody
@@ -40,6 +66,11 @@ class Recording:
                 raise InputError(f"Recording {name}: needs finite numbers of shape {shape}, got {array.shape}")
             array.setflags(write=False)
             object.__setattr__(self, name, array)
+        for prediction in self.predictions:
+            if len(prediction.positions) != n:
+                raise InputError(
+                    f"Recording predictions: {prediction.name} has {len(prediction.positions)} positions for {n} frames"
+                )
         if n < 1 or np.any(np.diff(self.times) <= 0.0):
             raise InputError(
                 "Recording times: needs at least one frame, and each frame must be later than the previous one"
@@ -72,17 +103,20 @@ class FrameRecorder:
         self.model = model
         self._period = 1.0 / rate
         self._frames: list[tuple[float, Array, Array]] = []
+        self._seen: list[Scene | None] = []
 
-    def note(self, data: mujoco.MjData, time: float | None = None) -> None:
+    def note(self, data: mujoco.MjData, time: float | None = None, *, scene: Scene | None = None) -> None:
         """Record the current poses if the next frame is due; call this method after every simulated step.
 
         Args:
             data: the state of the simulation, in which the body poses are up to date.
             time: simulated time [s]; None: ``data.time``.
+            scene: the observed scene, whose tracked obstacles are drawn where they are predicted to be.
         """
         now = float(data.time if time is None else time)
         if not self._frames or now >= self._frames[-1][0] + self._period - 1e-9:
             self._frames.append((now, np.array(data.xpos), np.array(data.xquat)))
+            self._seen.append(scene)
 
     def recording(self) -> Recording:
         """Return the recorded frames.
@@ -93,4 +127,25 @@ class FrameRecorder:
         if not self._frames:
             raise InputError("FrameRecorder: no frame was recorded; call note(data) after every simulated step")
         times, positions, quaternions = zip(*self._frames, strict=True)
-        return Recording(self.model, np.array(times), np.array(positions), np.array(quaternions))
+        return Recording(
+            self.model, np.array(times), np.array(positions), np.array(quaternions), _predictions(self._seen)
+        )
+
+
+def _predictions(seen: list[Scene | None]) -> tuple[Prediction, ...]:
+    """Return the predictions of all tracks in the observed scenes, one scene or None for each frame."""
+    found: dict[int, Prediction] = {}
+    for frame, scene in enumerate(seen):
+        if scene is None:
+            continue
+        ahead, _ = scene.poses(scene.stamp + AHEAD)
+        for i, number in enumerate(scene.packed.track_ids.tolist()):
+            if number < 0:
+                continue
+            if number not in found:
+                extent = 0.5 * np.ptp(scene.obstacles[i].bounds(), axis=0)
+                positions, covariances = np.full((len(seen), 3), np.nan), np.zeros((len(seen), 3, 3))
+                found[number] = Prediction(scene.name_of(i), positions, covariances, extent)
+            found[number].positions[frame] = ahead[i]
+            found[number].covariances[frame] = scene.packed.covariances[i]
+    return tuple(found.values())

@@ -28,6 +28,7 @@ from imitarm.viewer.page import (
     render,
     shared_players,
 )
+from imitarm.viewer.recording import AHEAD
 from imitarm.viewer.scene3d import ComponentMark, PathMark, playback_html
 
 _KEYS: Final = (
@@ -36,6 +37,7 @@ _KEYS: Final = (
     Key(palette.MEASURED, "measured path of the tool"),
     Key(palette.UNMOVED, "component, not moved", blob=True),
     Key(palette.MOVED, "component, moved", blob=True),
+    Key(palette.PREDICTED, f"tracked obstacle, predicted for {AHEAD:g} s later, with 95 % uncertainty", blob=True),
 )
 _WORDS: Final = {
     "Demonstration": "One recording of a motion demonstrated by a person, here by guiding the arm's tool by hand.",
@@ -98,7 +100,9 @@ def report_html(report: Report) -> str:
                 "result": scene,
                 "cells": [*_cells(scene), *(str(scene.details.get(key, "–")) for key in extra)],
                 "text": _sentences(scene.caption, "" if scene.success else scene.reason),
-                "player": Player(f"3-D playback: {scene.title}", own[scene.name], _KEYS) if scene.name in own else None,
+                "player": Player(f"3-D playback: {scene.title}", own[scene.name], _keys(scene))
+                if scene.name in own
+                else None,
                 "figures": list(_scene_figures(f"s{i + 1}", scene)),
                 "facts": _scene_facts(scene),
             },
@@ -187,6 +191,12 @@ def _playback(scene: SceneResult) -> str:
         lift = np.array([0.0, 0.0, 0.004])  # [m] where two paths coincide, the picture would flicker
         paths.append(PathMark("measured path", scene.rollout.trajectory.positions + lift, palette.MEASURED, 0.003))
     return playback_html(scene.recording, paths=paths, components=components)
+
+
+def _keys(scene: SceneResult) -> tuple[Key, ...]:
+    """Return the legend of the 3-D playback; predictions are in it only if an obstacle was tracked."""
+    tracked = scene.recording is not None and scene.recording.predictions
+    return _KEYS if tracked else _KEYS[:-1]
 
 
 def _scene_figures(key: str, scene: SceneResult) -> Iterator[Figure]:

@@ -21,7 +21,7 @@ from imitarm.errors import InputError, TaskFailedError
 from imitarm.kinematics.pose import matrix_to_quaternion
 from imitarm.viewer import palette
 from imitarm.viewer.person import PersonMark, draw_person
-from imitarm.viewer.recording import Recording
+from imitarm.viewer.recording import Prediction, Recording
 from imitarm.viewer.stage import (
     STEP,
     Camera,
@@ -175,6 +175,32 @@ def _draw_components(server: Any, components: Sequence[ComponentMark]) -> None:
         )
 
 
+def _draw_predictions(server: Any, predictions: Sequence[Prediction]) -> list[Mover]:
+    """Draw each predicted obstacle as an ellipsoid; return the nodes that must move.
+
+    The semi-axes are the half extents of the obstacle plus its 95 % uncertainty along the axes of the world frame.
+    """
+    movers = []
+    for number, prediction in enumerate(predictions):
+        seen = np.asarray(np.isfinite(prediction.positions).all(axis=1))
+        deviations = np.sqrt(np.maximum(np.diagonal(prediction.covariances, axis1=1, axis2=2), 0.0))
+        scale = np.round((prediction.extent + np.sqrt(_CHI2_95) * deviations) / STEP) * STEP
+        positions = np.round(np.nan_to_num(prediction.positions) / STEP) * STEP
+        handle = server.scene.add_icosphere(
+            node_name("predictions", number, prediction.name),
+            1.0,
+            palette.rgb(palette.PREDICTED),
+            opacity=0.3,
+            scale=tuple(scale[0].tolist()),
+            position=positions[0],
+            visible=bool(seen[0]),
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        movers.append(Mover(handle, {"position": positions, "scale": scale, "visible": seen}))
+    return movers
+
+
 def _free_port() -> int:
     """Return a free port of this machine; raise TaskFailedError if there is none, because viser would wait forever."""
     try:
@@ -227,7 +253,8 @@ def playback_html(
     """Draw a recording and return one self-contained HTML page that plays it.
 
     Args:
-        recording: the model and the recorded poses of its bodies. Only geoms in groups 0 to 2 are drawn.
+        recording: the model and the recorded poses of its bodies. Only geoms in groups 0 to 2 are drawn. Predicted
+            obstacles are drawn as translucent ellipsoids.
         paths: lines to draw.
         components: Gaussian components to draw as translucent ellipsoids.
         persons: people to draw; each must have as many frames as the recording.
@@ -254,6 +281,7 @@ def playback_html(
         movers = _draw_bodies(server, recording, parts)
         for person in persons:
             movers += draw_person(server, person)
+        movers += _draw_predictions(server, recording.predictions)
         _draw_paths(server, paths)
         _draw_components(server, components)
         serializer = server.get_scene_serializer()

@@ -139,7 +139,8 @@ class Mover:
         """Send those attributes of a frame that differ from the previous frame's; the first frame is not sent."""
         for name, values in self._poses.items():
             if self._changed[name][frame - 1]:
-                setattr(self._handle, name, bool(values[frame]) if values.ndim == 1 else values[frame])
+                value: Any = bool(values[frame]) if values.ndim == 1 else values[frame]
+                setattr(self._handle, name, tuple(value.tolist()) if name == "scale" else value)  # not as raw bytes
 
 
 def node_name(kind: str, *names: object) -> str:
