@@ -9,7 +9,9 @@ from imitarm.control_loop import reproduce
 from imitarm.errors import InputError
 from imitarm.policies import ACFRA, Stage, StagedPolicy
 from imitarm.safety import SafetyFilter
+from imitarm.scene import Scene, Sphere
 from imitarm.tasks.packing import BOTTLE, BOX, CLOSED, CUBE, OPEN, PackingTask, packing_skills, reach
+from imitarm.tasks.packing_run import run_packing
 
 ARM = PackingTask.arm()
 
@@ -24,6 +26,8 @@ def test_bottle_and_box_move_at_ordinary_speeds_and_stay_in_their_places(seed):
     assert np.linalg.norm(np.diff(box, axis=0), axis=1).max() / (times[1] - times[0]) < 0.06
     assert np.ptp(bottle[:, 2]) == 0.0 and np.ptp(box[:, 1:], axis=0).max() == 0.0
     assert (bottle[:, 1] + 0.05 < box[:, 1].min() - 0.12).all()
+    in_the_way = np.abs(bottle[:, 0] - 0.58) < 0.08
+    assert 0.1 < in_the_way.mean() < 0.9
     assert np.array_equal(PackingTask(seed, moving=False).bottle_at(9.0), task.bottle_at(0.0))
 
 
@@ -41,6 +45,7 @@ def test_the_sensor_sees_the_same_motion_as_the_simulator():
         np.testing.assert_allclose(goal.position[:2], task.box_at(time)[:2], atol=1e-12)
         assert goal.position[2] > box.bounds()[1, 2] + 0.04
     assert task.release(robot.scene_at_start) is None  # only boards: no box is seen
+    assert task.release(Scene(None, [Sphere([0.5, 0.3, 0.1], 0.1)])) is None
 
 
 def test_the_cube_is_picked_and_packed_while_everything_else_stands():
@@ -61,6 +66,13 @@ def test_the_cube_is_picked_and_packed_while_everything_else_stands():
     outside = task.evaluate(before, done)
     assert not outside.success and "mm from the middle of the box" in outside.reason
     assert before.data.body(CUBE).xpos[2] == pytest.approx(0.02, abs=1e-3)
+
+
+def test_the_cube_is_packed_while_box_and_bottle_move_as_a_sensor_and_a_tracker_see_them():
+    done = run_packing(PackingTask(2), arm=ARM)
+    assert done.success, done.reason
+    assert done.min_clearance > 0.0 and not done.details["contacts"]
+    assert done.details["statuses"]["avoiding"] > 0
 
 
 def test_the_demonstrated_motions_begin_and_end_where_they_should():

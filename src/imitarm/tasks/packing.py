@@ -38,12 +38,13 @@ _INSIDE, _THICK = (0.22, 0.22, 0.09), 0.01  # [m] of the box
 _BOX_AT, _BOX_TRAVEL = (0.58, 0.34), 0.06  # [m] mean place of the box, and amplitude of its motion along x
 _BOX_PERIOD = 8.0, 14.0  # [s]
 _BOTTLE = (0.033, 0.22)  # [m] radius and height
-_BOTTLE_ROOM = ((0.42, 0.76), (-0.14, 0.10))  # [m] ranges of x and y in which the bottle is pushed about
+_ON_PATH = ((0.53, 0.63), (-0.12, 0.08))  # [m] ranges of x and y of places in the way of the gripper
+_ASIDE = (0.72, 0.82), (0.40, 0.44)  # [m] ranges of x on both sides of them
 _PUSH_SPEED = 0.1, 0.3  # [m/s] mean speeds of the pushes
 _PAUSE = 0.3, 1.5  # [s] between two pushes
 _LONGEST = 60.0  # [s] for which motions are drawn
-_FIRST_FREE = 0.14  # [m] least distance of the bottle from the tool at the start
-_RELEASE = 0.055  # [m] of the tool above the rim of the box
+_SAME_SIZE = 0.05  # [m] largest difference of the size by which the box is recognised
+_RELEASE = 0.1  # [m] of the tool above the rim of the box
 _RISE = 0.26  # [m] of the carrying curve's control points
 _TABLE = (0.50, 0.0), (0.80, 1.30, 0.04)  # [m] its top is at height 0
 
@@ -52,8 +53,8 @@ _TABLE = (0.50, 0.0), (0.80, 1.30, 0.04)  # [m] its top is at height 0
 class PackingTask:
     """A Sawyer with a gripper picks a cube and puts it into a packing box that moves, while a bottle is pushed about.
 
-    The box slides back and forth on the table. The bottle is pushed at random times to random places between the cube
-    and the box, often across the path of the gripper. The task succeeds if the cube rests in the box, and the arm has
+    The box slides back and forth on the table. The bottle is pushed at random times from the side into the way of the
+    gripper, and out of it again. The task succeeds if the cube rests in the box, and the arm has
     touched neither the bottle nor the box.
 
     Attributes:
@@ -98,12 +99,20 @@ class PackingTask:
         return np.array([x, y, 0.5 * _BOTTLE[1]])
 
     def release(self, scene: Scene) -> Pose | None:
-        """Return the pose of the tool above the middle of the box that is seen in a scene; None if no box is seen."""
+        """Return the pose of the tool above the middle of the box that is seen in a scene; None if no box is seen.
+
+        A sensor reports no names, so the box is recognised by its size.
+        """
+        best, error = None, _SAME_SIZE
         for obstacle in scene.obstacles:
-            if obstacle.name == BOX:
-                low, high = obstacle.bounds()
-                return Pose(np.array([*(0.5 * (low + high))[:2], high[2] + _RELEASE]), np.array(LOOKING_DOWN))
-        return None
+            low, high = obstacle.bounds()
+            wrong = float(np.abs(high - low - _outer()).max())
+            if wrong < error:
+                best, error = (
+                    Pose(np.array([*(0.5 * (low + high))[:2], high[2] + _RELEASE]), np.array(LOOKING_DOWN)),
+                    wrong,
+                )
+        return best
 
     def truth(self) -> MovingScene:
         """Return what a sensor can see: the box as one solid, and the bottle, as they really move."""
@@ -113,10 +122,8 @@ class PackingTask:
         )
 
     def _solid_box(self, time: float) -> Box:
-        x, y, z = _INSIDE
-        outer = np.array([x + 2.0 * _THICK, y + 2.0 * _THICK, z + _THICK])
-        middle = self.box_at(time) + np.array([0.0, 0.0, 0.5 * (z - _THICK)])
-        return Box(Pose(middle, np.array([1.0, 0.0, 0.0, 0.0])), outer, name=BOX)
+        middle = self.box_at(time) + np.array([0.0, 0.0, 0.5 * (_INSIDE[2] - _THICK)])
+        return Box(Pose(middle, np.array([1.0, 0.0, 0.0, 0.0])), _outer(), name=BOX)
 
     def _bottle(self) -> Cylinder:
         pose = Pose(self.bottle_at(0.0), np.array([1.0, 0.0, 0.0, 0.0]))
@@ -181,23 +188,30 @@ def start_posture(arm: ArmModel) -> Array:
     return find_posture(arm, PackingTask.start)
 
 
+def _outer() -> Array:
+    """Return the outer size of the box, shape (3,) [m]."""
+    x, y, z = _INSIDE
+    return np.array([x + 2.0 * _THICK, y + 2.0 * _THICK, z + _THICK])
+
+
 def _fixtures() -> tuple[Obstacle, ...]:
     return (HalfSpace(np.zeros(3), name="table"), *standard_fixtures())
 
 
 @lru_cache(maxsize=64)
 def _pushes(seed: int) -> PchipInterpolator:
-    """Return the place (x, y) of the bottle over time: pushes to random places, at rest between them."""
+    """Return the place (x, y) of the bottle over time: pushes in and out of the gripper's way, at rest between them."""
     rng = np.random.default_rng([562, seed])
-    low, high = np.array(_BOTTLE_ROOM).T
-    place = rng.uniform(low, high)
-    while np.linalg.norm(place - PackingTask.start.position[:2]) < _FIRST_FREE:
-        place = rng.uniform(low, high)
-    times, places = [0.0], [place]
+
+    def drawn(x: tuple[float, float]) -> Array:
+        return np.array([rng.uniform(*x), rng.uniform(*_ON_PATH[1])])
+
+    times, places, aside = [0.0], [drawn(_ASIDE[rng.integers(2)])], False
     while times[-1] < _LONGEST:
         times.append(times[-1] + float(rng.uniform(*_PAUSE)))
         places.append(places[-1])
-        target = rng.uniform(low, high)
+        target = drawn(_ON_PATH[0]) if not aside else drawn(_ASIDE[rng.integers(2)])
+        aside = not aside
         way = float(np.linalg.norm(target - places[-1]))
         times.append(times[-1] + way / float(rng.uniform(*_PUSH_SPEED)) + 1e-3)
         places.append(target)
