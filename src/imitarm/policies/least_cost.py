@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imitarm.policies.obstacle_cost import Groups, ObstacleCost, PredictedObstacles
 from imitarm.skills.dynamical_systems import Gains
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
 _UP = np.array([0.0, 0.0, 1.0])
 _TIED = 1e-9  # costs that differ by less are equal
@@ -105,10 +109,11 @@ def frame(tangent: Array, axes: Array) -> Array:
     The frame depends on the motion and the vertical only, so a scene that is rotated about the vertical, or mirrored,
     has the rotated or mirrored candidates.
     """
-    d = axes.shape[1]
+    if axes.shape[1] == 3:
+        return _frame_in_space(*tangent.tolist())
     along = axes @ (tangent @ axes)
     length = float(np.sqrt(along.dot(along)))
-    if d < 2 or length < 1e-6:
+    if axes.shape[1] < 2 or length < 1e-6:
         return axes
     along = along / length
     for other in (_UP, axes[:, 0], axes[:, 1]):
@@ -117,26 +122,27 @@ def frame(tangent: Array, axes: Array) -> Array:
         length = float(np.sqrt(rest.dot(rest)))
         if length > 1e-3:
             break
-    rest = rest / length
-    if d == 2:
-        return np.stack([along, rest], axis=1)
-    left = np.array(
-        [
-            rest[1] * along[2] - rest[2] * along[1],
-            rest[2] * along[0] - rest[0] * along[2],
-            rest[0] * along[1] - rest[1] * along[0],
-        ]
-    )
-    return np.stack([along, left, rest], axis=1)
+    return np.stack([along, rest / length], axis=1)
+
+
+def _frame_in_space(x: float, y: float, z: float) -> Array:
+    """Return the frame of a motion in the direction (x, y, z); that of the base if the direction is 0 or vertical."""
+    across = math.hypot(x, y)
+    if across < 1e-3:
+        return np.eye(3)
+    length = math.hypot(across, z)
+    a, b, c = x / length, y / length, z / length
+    d = across / length
+    return np.array([[a, -b / d, -a * c / d], [b, a / d, -b * c / d], [c, 0.0, d]])
 
 
 class Prediction(NamedTuple):
-    """The motion without coupling over the horizon, for one speed of the phase.
+    """The motion without coupling over the horizon, for R speeds of the phase.
 
     Attributes:
-        centers: centres of the tool's spheres without coupling, shape (H, S, 3) [m].
+        centers: centres of the tool's spheres without coupling, shape (R, H, S, 3) [m].
         free: deviations without coupling, shape (H, 3) [m].
-        precision: Theta, shape (H, 3, 3).
+        precision: Theta, shape (R, H, 3, 3).
     """
 
     centers: Array
@@ -148,16 +154,22 @@ class Choice(NamedTuple):
     """The candidate of least cost.
 
     Attributes:
-        push: coupling acceleration u, shape (3,) [m/s^2].
+        scaled: coupling acceleration u / a_max, shape (3,).
         rate: speed of the phase, 1 is the learned speed.
         cost: its cost.
-        nearest: index of the obstacle that comes nearest, and its distance less the margin [m]; None if none is near.
+        nearest: index of the obstacle that comes nearest; -1 if none is near.
+        gap: distance of the tool to this obstacle, less the margin [m].
     """
 
-    push: Array
+    scaled: Array
     rate: float
     cost: float
-    nearest: tuple[int, float] | None
+    nearest: int
+    gap: float
+
+
+STAY = Choice(np.zeros(3), 1.0, 0.0, -1, math.inf)
+"""The choice where no obstacle is near: the tool returns to its path by itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,23 +184,28 @@ class LeastCost:
     distance, and a horizon over which both are summed. The candidates are u = 0, and three sizes of u in each heading.
     The speeds are those of ``rates``: to wait (r = 0) and to go back (r < 0) are candidates like the others.
 
-    The parts of the cost without obstacles cost nearly nothing to compute. The candidates are therefore taken in the
-    order of these parts, and the search ends when no remaining one can be better.
+    The result is the least cost of all candidates at all speeds, but few distances are computed. No candidate costs
+    less than its cost without the obstacles, and an obstacle that the tool can't reach until an instant costs nothing
+    there.
 
     Attributes:
         response: deviation at the instants of the horizon.
+        obstacle_cost: b.
         max_acceleration: a_max [m/s^2].
+        units: headings in the frame of :func:`frame`, shape (k, d).
         discount: gamma.
         deviation_weight: w_e [1/m^2].
         change_weight: w_Delta.
         size_weight: w_u.
         wait_weight: w_r.
-        rates: speeds of the phase.
+        rates: speeds of the phase; the first one is 1.
         sizes: sizes of u, as fractions of a_max.
     """
 
     response: Response
+    obstacle_cost: ObstacleCost
     max_acceleration: float
+    units: Array
     discount: float = 0.93
     deviation_weight: float = 16.0
     change_weight: float = 0.02
@@ -197,103 +214,203 @@ class LeastCost:
     rates: tuple[float, ...] = (1.0, 0.5, 0.0, -0.5)
     sizes: tuple[float, ...] = (0.35, 0.7, 1.0)
 
-    def candidates(self, directions: Array) -> Array:
-        """Return u / a_max of all candidates for unit directions (k, 3), shape (1 + 3 k, 3)."""
-        sized = [size * directions for size in self.sizes]
-        return np.concatenate([np.zeros((1, 3)), *sized])
+    @cached_property
+    def _weights(self) -> Array:
+        return np.asarray(self.discount ** np.arange(1.0, len(self.response.G) + 1.0))
 
-    def smooth_cost(self, scaled: Array, prediction: Prediction, previous: Array) -> Array:
-        """Return the cost of candidates ``scaled`` = u / a_max (C, 3) without the obstacles, shape (C,).
+    @cached_property
+    def _gains(self) -> Array:
+        """Deviation at each instant per unit of u / a_max, shape (H,) [m]."""
+        return self.max_acceleration * self.response.G
+
+    @cached_property
+    def _candidates(self) -> tuple[Array, Array]:
+        """All candidates u / a_max in the frame of the motion (C, d), and the cost of their size (C,)."""
+        zero = np.zeros((1, self.units.shape[1]))
+        scaled = np.concatenate([zero, *[size * self.units for size in self.sizes]])
+        return scaled, (self.size_weight + self.change_weight) * np.sum(scaled * scaled, axis=1)
+
+    @cached_property
+    def _waiting(self) -> Array:
+        """The cost of each speed, shape (R,)."""
+        return np.array([self.wait_weight * (1.0 - rate) ** 2 for rate in self.rates])
+
+    @property
+    def travel(self) -> float:
+        """Largest deviation within the horizon because of u [m]."""
+        return float(self._gains[-1])
+
+    def smooth_costs(self, scaled: Array, sizes: Array, previous: Array, prediction: Prediction) -> Array:
+        """Return the costs of C candidates at R speeds without those of obstacles and waiting, shape (R, C).
 
         The task cost is a quadratic form in u, so the deviations of the candidates are not needed.
+
+        Args:
+            scaled: u / a_max of the candidates, shape (C, 3).
+            sizes: cost of their sizes, shape (C,).
+            previous: u / a_max of the last choice, shape (3,).
+            prediction: motion without coupling.
         """
-        weight = self.deviation_weight * self.discount ** np.arange(1.0, len(self.response.G) + 1.0)
-        gain = self.max_acceleration * self.response.G
-        pulled = np.matmul(prediction.precision, prediction.free[..., None])[..., 0]
-        constant = 0.5 * float(np.sum(weight[:, None] * pulled * prediction.free))
-        slope = (weight * gain) @ pulled
-        curvature = np.tensordot(weight * gain * gain, prediction.precision, axes=1)
-        cost = constant + scaled @ slope + 0.5 * np.sum((scaled @ curvature) * scaled, axis=1)
-        change = scaled - previous
-        cost += self.change_weight * np.sum(change * change, axis=1) + self.size_weight * np.sum(
-            scaled * scaled, axis=1
-        )
-        return np.asarray(cost)
+        task = self.deviation_weight * self._weights
+        pull = task * self._gains
+        n = len(prediction.precision)
+        pulled = np.matmul(prediction.precision, prediction.free[:, :, None])[..., 0]
+        constant = 0.5 * (np.sum(pulled * prediction.free, axis=2) @ task) + self.change_weight * previous.dot(previous)
+        slope = np.matmul(pull, pulled) - 2.0 * self.change_weight * previous
+        curvature = (pull * self._gains) @ prediction.precision.reshape(n, -1, 9)
+        squares = (scaled[:, :, None] * scaled[:, None, :]).reshape(-1, 9)
+        cost: Array = slope @ scaled.T + 0.5 * (curvature @ squares.T)
+        cost += constant[:, None]
+        cost += sizes
+        return cost
 
     def choose(
         self,
-        scaled: Array,
+        axes: Array,
+        one_sided: Array,
         previous: Array,
-        predict: Callable[[float], Prediction],
-        obstacles: Callable[[Array], tuple[Array, Array]] | None,
+        predict: Callable[[Array], Prediction],
+        obstacles: PredictedObstacles,
     ) -> Choice:
         """Return the candidate of least cost.
 
         Args:
-            scaled: u / a_max of the candidates, shape (C, 3).
+            axes: frame of the motion, shape (3, d).
+            one_sided: directions in which u must have no component, shape (m, 3).
             previous: u / a_max of the last choice, shape (3,).
-            predict: returns the motion without coupling for a speed of the phase.
-            obstacles: returns costs (n, H, C) and gaps (n, H, C) of the spheres' centres (H, C, S, 3); None if no
-                obstacle is near.
+            predict: returns the motion without coupling for speeds of the phase, shape (R,).
+            obstacles: the obstacles that may come near.
         """
+        scaled, sizes = self._candidates
+        scaled = scaled @ axes.T
+        if len(one_sided):
+            allowed = (scaled @ one_sided.T <= _TIED).all(axis=1)
+            scaled, sizes = scaled[allowed], sizes[allowed]
         best: Choice | None = None
-        for rate in self.rates:
-            waiting = self.wait_weight * (1.0 - rate) ** 2
-            if best is not None and waiting > best.cost + _TIED:
-                continue
-            prediction = predict(rate)
-            smooth = self.smooth_cost(scaled, prediction, previous) + waiting
-            found = self._best(scaled, smooth, prediction, obstacles, np.inf if best is None else best.cost)
-            if found is not None and (best is None or found[1] < best.cost - _TIED):
-                index, cost, nearest = found
-                best = Choice(self.max_acceleration * scaled[index], rate, cost, nearest)
-            if obstacles is None:
+        for begin, end in ((0, 1), (1, len(self.rates))):
+            waiting = self._waiting[begin:end]
+            if best is not None and (waiting.min(initial=math.inf) > best.cost):
                 break
+            prediction = predict(np.array(self.rates[begin:end]))
+            smooth = self.smooth_costs(scaled, sizes, previous, prediction) + waiting[:, None]
+            found = self._best(scaled, smooth, prediction, obstacles, math.inf if best is None else best.cost)
+            if found is not None and (best is None or found[2] < best.cost - _TIED):
+                rate, index, cost, nearest, gap = found
+                best = Choice(scaled[index], self.rates[begin + rate], cost, nearest, gap)
         assert best is not None
         return best
 
     def _best(
-        self,
-        scaled: Array,
-        smooth: Array,
-        prediction: Prediction,
-        obstacles: Callable[[Array], tuple[Array, Array]] | None,
-        bound: float,
-    ) -> tuple[int, float, tuple[int, float] | None] | None:
-        """Return index, cost and nearest obstacle of the best candidate for one speed; None if none is below bound."""
-        if obstacles is None:
-            return 0, float(smooth[0]), None  # the tool returns to the path by itself
-        weight = self.discount ** np.arange(1.0, len(self.response.G) + 1.0)
-        order = np.argsort(smooth, kind="stable")
-        gain = (self.max_acceleration * self.response.G)[:, None, None, None]
-        costs = np.full(len(scaled), np.inf)
-        gaps: dict[int, Array] = {}
-        begin = 0
-        for end in (1, 9, len(order)):
-            part = order[begin:end]
-            bound_now = min(bound, float(costs.min())) + _TIED
-            part = part[smooth[part] <= bound_now]
-            if not len(part):
-                break
-            points = prediction.centers[:, None] + gain * scaled[part][:, None]
-            cost, gap = obstacles(points)
-            costs[part] = smooth[part] + np.sum(weight[:, None] * cost.sum(axis=0), axis=0)
-            for column, candidate in enumerate(part.tolist()):
-                gaps[candidate] = gap[:, :, column]
-            begin = end
-        index = self._first_of_best(costs, scaled)
-        if not np.isfinite(costs[index]):
+        self, scaled: Array, smooth: Array, prediction: Prediction, obstacles: PredictedObstacles, bound: float
+    ) -> tuple[int, int, float, int, float] | None:
+        """Return speed, candidate, cost, nearest obstacle and its distance of the best one; None if above ``bound``."""
+        n_rates, H, S, _ = prediction.centers.shape
+        n, shape = len(obstacles.packed), (n_rates, len(obstacles.packed), H, S)
+        every = _Pairs.all(*shape)
+        centers = prediction.centers.reshape(-1, 3).T[:, every.center]
+        gaps = self.obstacle_cost.gaps(obstacles, every.groups, centers[:, :, None])
+        free_gaps = gaps[:, 0].reshape(shape)
+        costs = np.full((n_rates, len(scaled)), math.inf)
+        values = self.obstacle_cost.values(obstacles, every.groups, centers[:, :, None], gaps.copy())
+        free = values.reshape(shape).max(axis=3).sum(axis=1) @ self._weights
+        costs[:, 0] = smooth[:, 0] + free
+        least = min(bound, float(costs[:, 0].min()))
+        columns = (smooth.min(axis=0) <= least + _TIED).nonzero()[0]
+        columns = columns[columns > 0]
+        found: _Evaluated | None = None
+        if len(columns):
+            found = self._evaluate(scaled[columns], prediction, obstacles, free_gaps)
+            costs[:, columns] = smooth[:, columns] + found.costs
+        rate, index = _first_of_best(costs, scaled)
+        cost = float(costs[rate, index])
+        if cost > bound:
             return None
-        each = gaps[index].min(axis=1)
-        nearest = int(each.argmin())
-        return index, float(costs[index]), (nearest, float(each[nearest]))
+        if index == 0 or found is None or not len(found.gaps):
+            each = free_gaps[rate].reshape(n, -1).min(axis=1)
+            nearest = int(each.argmin())
+            return rate, index, cost, nearest, float(each[nearest])
+        return rate, index, cost, *found.nearest(rate, int(np.searchsorted(columns, index)))
+
+    def _evaluate(
+        self, scaled: Array, prediction: Prediction, obstacles: PredictedObstacles, free_gaps: Array
+    ) -> _Evaluated:
+        """Return the costs of candidates (C, 3), with those pairs only that any candidate can bring near each other."""
+        gains, S = self._gains[:, None], free_gaps.shape[3]
+        near = free_gaps - gains <= self.obstacle_cost.influence(obstacles.packed)[:, None, None]
+        if S > 1:  # a sphere that can't become the nearest one has no effect
+            near &= free_gaps <= free_gaps.min(axis=3, keepdims=True) + 2.0 * gains
+        pairs = _Pairs.where(near)
+        reach = self._gains[pairs.groups.instant]
+        centers = prediction.centers.reshape(-1, 3).T[:, pairs.center]
+        points = centers[:, :, None] + reach[:, None] * scaled.T[:, None]
+        gaps = self.obstacle_cost.gaps(obstacles, pairs.groups, points)
+        values = self.obstacle_cost.values(obstacles, pairs.groups, points, gaps.copy())
+        rate, groups = pairs.rate, pairs.groups
+        if S > 1 and len(rate):
+            first = np.flatnonzero(np.diff(pairs.key, prepend=-1))
+            values = np.maximum.reduceat(values, first, axis=0)
+            rate, instant = rate[first], groups.instant[first]
+        else:
+            instant = groups.instant
+        weights = np.zeros((len(free_gaps), len(rate)))
+        weights[rate, np.arange(len(rate))] = self._weights[instant]
+        return _Evaluated(weights @ values, gaps, pairs)
+
+
+class _Pairs(NamedTuple):
+    """Pairs of an obstacle and a sphere at one instant and one speed of the phase.
+
+    Attributes:
+        rate: index of the speed, shape (k,).
+        groups: obstacle, instant and sphere.
+        center: index of the sphere's centre among all (rate, instant, sphere), shape (k,).
+        key: number of (rate, obstacle, instant), shape (k,).
+    """
+
+    rate: Indices
+    groups: Groups
+    center: Indices
+    key: Indices
+
+    @classmethod
+    def of(cls, flat: Indices, n_obstacles: int, horizon: int, spheres: int) -> _Pairs:
+        key, sphere = np.divmod(flat, spheres) if spheres > 1 else (flat, np.zeros_like(flat))
+        block, instant = np.divmod(key, horizon)
+        rate, obstacle = np.divmod(block, n_obstacles)
+        return cls(rate, Groups(obstacle, instant, sphere), (rate * horizon + instant) * spheres + sphere, key)
+
+    @classmethod
+    def where(cls, chosen: NDArray[np.bool_]) -> _Pairs:
+        """Return the pairs for which ``chosen`` (R, n, H, S) is true."""
+        return cls.of(chosen.ravel().nonzero()[0], *chosen.shape[1:])
 
     @staticmethod
-    def _first_of_best(costs: Array, scaled: Array) -> int:
-        """Return the index of the least cost; of equal ones, that which leads highest, then the first one."""
-        least = float(costs.min())
-        tied = (costs <= least + _TIED * max(1.0, abs(least))).nonzero()[0]
-        if len(tied) == 1 or not np.isfinite(least):
-            return int(costs.argmin())
-        height = scaled[tied, 2]
-        return int(tied[(height >= height.max() - _TIED).nonzero()[0][0]])
+    @lru_cache(maxsize=64)
+    def all(rates: int, n_obstacles: int, horizon: int, spheres: int) -> _Pairs:
+        """Return all pairs, in the order (rate, obstacle, instant, sphere)."""
+        return _Pairs.of(np.arange(rates * n_obstacles * horizon * spheres), n_obstacles, horizon, spheres)
+
+
+class _Evaluated(NamedTuple):
+    """Costs of candidates because of obstacles (R, C), and the gaps (k, C) [m] of the pairs that were computed."""
+
+    costs: Array
+    gaps: Array
+    pairs: _Pairs
+
+    def nearest(self, rate: int, column: int) -> tuple[int, float]:
+        """Return the obstacle that comes nearest with one candidate, and its distance [m]."""
+        gaps = np.where(self.pairs.rate == rate, self.gaps[:, column], math.inf)
+        least = int(gaps.argmin())
+        return int(self.pairs.groups.obstacle[least]), float(gaps[least])
+
+
+def _first_of_best(costs: Array, scaled: Array) -> tuple[int, int]:
+    """Return speed and candidate of the least cost; of equal ones, that which leads highest, then the first one."""
+    least = float(costs.min())
+    rates, tied = (costs <= least + _TIED * max(1.0, abs(least))).nonzero()
+    if len(tied) == 1:
+        return int(rates[0]), int(tied[0])
+    height = scaled[tied, 2]
+    first = int((height >= height.max() - _TIED).nonzero()[0][0])
+    return int(rates[first]), int(tied[first])

@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import quaternion_to_matrix
-from imitarm.scene.distances import KINDS, PackedObstacles, distances, distances_and_gradients
+from imitarm.scene.distances import KINDS, PackedObstacles, distances_and_gradients, group_distances
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
 _LARGEST_EXPONENT = 60.0  # deeper inside an obstacle the cost grows no more, so that it stays finite
+_NEGLIGIBLE = 14.0  # exp(-14) is 1e-6: a smaller cost has no effect
 
 
 class PredictedObstacles(NamedTuple):
@@ -31,10 +33,19 @@ class PredictedObstacles(NamedTuple):
     times: Array
     margin: Array
 
-    @property
-    def centers(self) -> Array:
-        """Predicted positions, shape (n, H, 3) [m]."""
-        return self.packed.positions[:, None] + self.times[:, None] * self.packed.velocities[:, None]
+
+class Groups(NamedTuple):
+    """Pairs of an obstacle and a sphere of the tool, each at one instant; candidates are compared within a pair.
+
+    Attributes:
+        obstacle: index of the obstacle, shape (k,).
+        instant: index of the instant, shape (k,).
+        sphere: index of the sphere of the tool, shape (k,).
+    """
+
+    obstacle: Indices
+    instant: Indices
+    sphere: Indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,30 +61,48 @@ class ObstacleCost(ABC):
     radii: Array
 
     @abstractmethod
-    def values(self, obstacles: PredictedObstacles, points: Array) -> tuple[Array, Array]:
-        """Return the cost of each obstacle, and what the cost depends on.
+    def influence(self, packed: PackedObstacles) -> Array:
+        """Return the distances between tool and obstacles beyond which the cost is negligible, shape (n,) [m]."""
+
+    def gaps(self, obstacles: PredictedObstacles, groups: Groups, points: Array) -> Array:
+        """Return the distances between the spheres and the obstacles, less the margin, shape (k, C) [m].
 
         Args:
             obstacles: n obstacles at H instants.
-            points: centres of the tool's S spheres at the H instants, for C candidates, shape (H, C, S, 3) [m].
+            groups: k pairs.
+            points: centre of the sphere of each pair for C candidates, one row for each axis, shape (3, k, C) [m].
+        """
+        less = self.radii[groups.sphere] + obstacles.margin[groups.obstacle, groups.instant]
+        times = obstacles.times[groups.instant]
+        return group_distances(obstacles.packed, groups.obstacle, points, times) - less[:, None]
 
-        Returns:
-            Costs, shape (n, H, C), and distances between tool and obstacles, less the margin, shape (n, H, C) [m].
+    @abstractmethod
+    def values(self, obstacles: PredictedObstacles, groups: Groups, points: Array, gaps: Array) -> Array:
+        """Return the cost of each pair, shape (k, C).
+
+        The cost of a tool of several spheres is the largest cost of its spheres.
+
+        Args:
+            obstacles: n obstacles at H instants.
+            groups: k pairs.
+            points: see :meth:`gaps`.
+            gaps: result of :meth:`gaps`; the method may overwrite it.
         """
 
     @abstractmethod
-    def gradients(self, obstacles: PredictedObstacles, points: Array) -> Array:
-        """Return the gradient of the costs with respect to a displacement of the tool, shape (n, H, C, 3) [1/m]."""
+    def gradients(self, obstacles: PredictedObstacles, groups: Groups, points: Array) -> Array:
+        """Return the gradient of :meth:`values` with respect to the points, shape (3, k, C) [1/m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class DistanceCost(ObstacleCost):
     r"""Cost by the signed distance, for any convex shape.
 
-    .. math:: b = \exp(-(gap - d_{safe}) / w), \qquad gap = \min_j (sd(\chi_j) - r_j) - margin
+    .. math:: b = \exp(-(gap - d_{safe}) / w), \qquad gap = sd(\chi) - r - margin
 
-    The tool is made of spheres j with radii r_j. The cost is 1 at the required clearance ``d_safe`` and grows by the
-    factor e for each width w towards the obstacle. At a distance of 0.3 m it is below 1e-12, which serves as cut-off.
+    Here ``sd`` is the signed distance of the predicted obstacle at the centre of a sphere of the tool, and ``r`` is the
+    sphere's radius. The cost is 1 at the required clearance ``d_safe`` and grows by the factor e for each width ``w``
+    towards the obstacle. At 14 widths from the required clearance it is 1e-6; this serves as the cut-off.
 
     Attributes:
         width: w [m].
@@ -81,26 +110,31 @@ class DistanceCost(ObstacleCost):
 
     width: float = 0.01
 
-    def values(self, obstacles: PredictedObstacles, points: Array) -> tuple[Array, Array]:
-        """Return costs and gaps, see :class:`ObstacleCost`."""
-        distance = distances(obstacles.packed, points, obstacles.times)
-        gap = distance[..., 0] - self.radii[0] if len(self.radii) == 1 else (distance - self.radii).min(axis=-1)
-        gap -= obstacles.margin[..., None]
-        return self._cost(gap), gap
+    def influence(self, packed: PackedObstacles) -> Array:
+        """Return the distances beyond which the cost is negligible, shape (n,) [m]."""
+        return np.full(len(packed), self.clearance + _NEGLIGIBLE * self.width)
 
-    def gradients(self, obstacles: PredictedObstacles, points: Array) -> Array:
-        """Return gradients, see :class:`ObstacleCost`."""
-        distance, normal = distances_and_gradients(obstacles.packed, points, obstacles.times)
-        distance = distance - self.radii
-        nearest = distance.argmin(axis=-1)[..., None]
-        gap = np.take_along_axis(distance, nearest, axis=-1)[..., 0] - obstacles.margin[..., None]
-        normal = np.take_along_axis(normal, nearest[..., None], axis=-2)[..., 0, :]
-        return np.asarray(-(self._cost(gap) / self.width)[..., None] * normal)
+    def values(self, obstacles: PredictedObstacles, groups: Groups, points: Array, gaps: Array) -> Array:
+        """Return the cost of each pair, shape (k, C); see :class:`ObstacleCost`."""
+        del obstacles, groups, points
+        return self._cost(gaps)
 
-    def _cost(self, gap: Array) -> Array:
-        exponent = (self.clearance - gap) * (1.0 / self.width)
-        np.minimum(exponent, _LARGEST_EXPONENT, out=exponent)
-        return np.asarray(np.exp(exponent, out=exponent))
+    def gradients(self, obstacles: PredictedObstacles, groups: Groups, points: Array) -> Array:
+        """Return the gradient of the costs, shape (3, k, C) [1/m]; see :class:`ObstacleCost`."""
+        cost = self._cost(self.gaps(obstacles, groups, points))
+        normals = np.empty_like(points)
+        for k, (obstacle, instant) in enumerate(zip(groups.obstacle, groups.instant, strict=True)):
+            times = obstacles.times[instant : instant + 1]
+            normals[:, k] = distances_and_gradients(obstacles.packed, points[None, :, k].transpose(0, 2, 1), times)[1][
+                obstacle, 0
+            ].T
+        return np.asarray(-cost / self.width * normals)
+
+    def _cost(self, gaps: Array) -> Array:
+        gaps -= self.clearance
+        gaps *= -1.0 / self.width
+        np.minimum(gaps, _LARGEST_EXPONENT, out=gaps)
+        return np.asarray(np.exp(gaps, out=gaps))
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +149,7 @@ class GaussianCost(ObstacleCost):
 
     Here ``a_j`` are the obstacle's semi-axes, ``r`` is the radius of a sphere of the tool and ``P`` is the covariance
     of the predicted position. The mean over P is the closed form of the sample mean in thesis Eq 5.5, whose exponent
-    lacks its minus sign. For a tool of several spheres, the largest of their costs counts.
+    lacks its minus sign.
 
     The height ``alpha = k l^2 e^2`` (with l the least of the lengths and k the stiffness of the task's cost) makes the
     push at the distance 2 l, which is the required clearance, hold a deviation of 2 l against the task's cost.
@@ -126,33 +160,45 @@ class GaussianCost(ObstacleCost):
 
     stiffness: float = 1.0
 
-    def _parts(self, obstacles: PredictedObstacles, points: Array) -> tuple[Array, Array, Array]:
-        """Return costs (n, H, C, S), offsets (n, H, C, S, 3) [m] and precisions (n, S, 3, 3) [1/m^2]."""
-        packed = obstacles.packed
-        lengths = 0.5 * (_semi_axes(packed)[:, None] + (self.radii + self.clearance)[:, None])  # (n, S, 3)
-        rotation = quaternion_to_matrix(packed.quaternions)[:, None]
-        shape = (rotation * (lengths**2)[..., None, :]) @ np.swapaxes(rotation, -1, -2)
-        spread = shape + packed.covariances[:, None]
-        precision = np.asarray(np.linalg.inv(spread), dtype=float)
-        height = self.stiffness * lengths.min(axis=-1) ** 2 * np.e**2
-        height = height * np.sqrt(np.prod(lengths**2, axis=-1) / np.linalg.det(spread))
-        offset = points - obstacles.centers[:, :, None, None]
-        square = np.einsum("nhcsi,nsij,nhcsj->nhcs", offset, precision, offset)
-        costs: Array = height[:, None, None] * np.exp(-0.5 * square)
-        return costs, offset, precision
+    def influence(self, packed: PackedObstacles) -> Array:
+        """Return the distances beyond which the cost is negligible, shape (n,) [m]."""
+        reach = np.sqrt(2.0 * _NEGLIGIBLE)
+        axes = _semi_axes(packed).max(axis=1)
+        longest = 0.5 * (axes + float(self.radii.max()) + self.clearance)
+        spread = np.sqrt(longest**2 + np.trace(packed.covariances, axis1=1, axis2=2))
+        return np.asarray(reach * spread)
 
-    def values(self, obstacles: PredictedObstacles, points: Array) -> tuple[Array, Array]:
-        """Return costs and gaps, see :class:`ObstacleCost`."""
-        costs, _, _ = self._parts(obstacles, points)
-        gap = (distances(obstacles.packed, points, obstacles.times) - self.radii).min(axis=-1)
-        return costs.max(axis=-1), gap
+    def _shapes(self, obstacles: PredictedObstacles, groups: Groups) -> tuple[Array, Array]:
+        """Return the heights (k,) and the precisions (L + P)^-1 (k, 3, 3) [1/m^2] of the pairs."""
+        packed, i = obstacles.packed, groups.obstacle
+        lengths = 0.5 * (_semi_axes(packed)[i] + (self.radii[groups.sphere] + self.clearance)[:, None])
+        rotation = quaternion_to_matrix(packed.quaternions[i])
+        shape = (rotation * (lengths**2)[:, None, :]) @ np.swapaxes(rotation, -1, -2)
+        spread = shape + packed.covariances[i]
+        height = self.stiffness * lengths.min(axis=1) ** 2 * np.e**2
+        height = height * np.prod(lengths, axis=1) / np.sqrt(np.linalg.det(spread))
+        return height, np.asarray(np.linalg.inv(spread), dtype=float)
 
-    def gradients(self, obstacles: PredictedObstacles, points: Array) -> Array:
-        """Return gradients, see :class:`ObstacleCost`."""
-        costs, offset, precision = self._parts(obstacles, points)
-        each = -costs[..., None] * np.einsum("nsij,nhcsj->nhcsi", precision, offset)
-        highest = costs.argmax(axis=-1)[..., None, None]
-        return np.take_along_axis(each, highest, axis=-2)[..., 0, :]
+    def _offsets(self, obstacles: PredictedObstacles, groups: Groups, points: Array) -> Array:
+        """Return the vectors from the obstacles' centres to the points, shape (3, k, C) [m]."""
+        packed, i = obstacles.packed, groups.obstacle
+        centers = packed.positions[i] + obstacles.times[groups.instant, None] * packed.velocities[i]
+        return np.asarray(points - centers.T[:, :, None])
+
+    def values(self, obstacles: PredictedObstacles, groups: Groups, points: Array, gaps: Array) -> Array:
+        """Return the cost of each pair, shape (k, C); see :class:`ObstacleCost`."""
+        del gaps
+        height, precision = self._shapes(obstacles, groups)
+        offset = self._offsets(obstacles, groups, points)
+        square = np.einsum("ikc,kij,jkc->kc", offset, precision, offset, optimize=True)
+        return np.asarray(height[:, None] * np.exp(-0.5 * square))
+
+    def gradients(self, obstacles: PredictedObstacles, groups: Groups, points: Array) -> Array:
+        """Return the gradient of the costs, shape (3, k, C) [1/m]; see :class:`ObstacleCost`."""
+        height, precision = self._shapes(obstacles, groups)
+        offset = self._offsets(obstacles, groups, points)
+        pull = np.einsum("kij,jkc->ikc", precision, offset)
+        return np.asarray(-height[:, None] * np.exp(-0.5 * np.sum(offset * pull, axis=0)) * pull)
 
 
 def _semi_axes(packed: PackedObstacles) -> Array:
@@ -170,8 +216,6 @@ def _semi_axes(packed: PackedObstacles) -> Array:
             row[:] = a, a, a + 0.5 * b
         elif name in {"cylinder", "cone"}:
             row[:] = a, a, 0.5 * b
-        elif name == "sphere":
-            row[:] = a
         else:
-            row[:] = a, b, c
+            row[:] = (a, a, a) if name == "sphere" else (a, b, c)
     return axes

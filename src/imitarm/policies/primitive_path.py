@@ -85,21 +85,31 @@ class PrimitivePath:
             quaternions = self.dmp.generate(self.start, goal, dt=self.duration / N_SAMPLES).quaternions
         return replace(self, goal=goal, positions=positions, quaternions=quaternions)
 
-    def position(self, phases: Array) -> Array:
-        """Return xi at phases (k,), shape (k, 3) [m]; a phase outside 0 to 1 counts as the nearest end."""
+    def positions_at(self, phases: Array) -> Array:
+        """Return xi at phases (...), shape (..., 3) [m]; a phase outside 0 to 1 counts as the nearest end."""
         x = np.minimum(np.maximum(phases, 0.0), 1.0) * N_SAMPLES
         i = np.minimum(x.astype(np.intp), N_SAMPLES - 1)
-        before = self.positions.take(i, axis=0)
-        return before + (x - i)[:, None] * (self.positions.take(i + 1, axis=0) - before)
+        before = self.positions[i]
+        return np.asarray(before + (x - i)[..., None] * self._steps[i])
+
+    def position(self, phase: float) -> Array:
+        """Return xi at one phase from 0 to 1, shape (3,) [m]."""
+        x = phase * N_SAMPLES
+        i = min(int(x), N_SAMPLES - 1)
+        return np.asarray(self.positions[i] + (x - i) * self._steps[i])
+
+    @cached_property
+    def _steps(self) -> Array:
+        return np.diff(self.positions, axis=0)
 
     def nearest(self, phases: Array) -> NDArray[np.intp]:
-        """Return the indices of the nearest samples, shape (k,)."""
+        """Return the indices of the nearest samples, same shape."""
         return np.rint(np.minimum(np.maximum(phases, 0.0), 1.0) * N_SAMPLES).astype(np.intp)
 
     def tangent(self, phase: float) -> Array:
         """Return the direction of the motion (3,): that to the goal where the motion rests; 0 at the goal."""
         i = min(int(phase * N_SAMPLES), N_SAMPLES - 1)
-        along = self.positions[i + 1] - self.positions[i]
+        along = self._steps[i]
         length = float(np.sqrt(along.dot(along)))
         if length * N_SAMPLES < _FLOOR:
             along = self.goal.position - self.positions[i]
@@ -119,8 +129,7 @@ class PrimitivePath:
     @cached_property
     def speed(self) -> float:
         """Highest speed of the motion [m/s]."""
-        steps = np.diff(self.positions, axis=0)
-        return float(np.sqrt(np.sum(steps * steps, axis=1).max())) * N_SAMPLES / self.duration
+        return float(np.sqrt(np.sum(self._steps**2, axis=1).max())) * N_SAMPLES / self.duration
 
     @cached_property
     def rotations(self) -> Array | None:

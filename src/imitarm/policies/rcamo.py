@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,8 @@ from imitarm.kinematics.pose import (
     quaternion_multiply,
     quaternion_to_matrix,
 )
-from imitarm.policies.least_cost import Choice, LeastCost, Prediction, Response, allowed_axes, frame, headings
+from imitarm.perception.margins import CoverageMargin
+from imitarm.policies.least_cost import STAY, Choice, LeastCost, Prediction, Response, allowed_axes, frame, headings
 from imitarm.policies.obstacle_cost import DistanceCost, GaussianCost, ObstacleCost, PredictedObstacles
 from imitarm.policies.policy import Observation, Policy
 from imitarm.policies.primitive_path import PrimitivePath
@@ -30,18 +31,10 @@ from imitarm.validation import choice, finite_array, finite_number, instance, wh
 Array = NDArray[np.float64]
 
 _SAME_PLACE = 5e-3  # [m, rad] a start nearer than this to the learned one is the learned one
-_NO_INFLUENCE = 0.3  # [m] beyond the clearance: an obstacle that stays farther away has no effect
 _RATE_TIME = 0.1  # [s] in which the phase takes up another speed
 _STANDS = 0.1  # speed of the phase below which the motion is said to wait
 _DISPLACED = 1e-3  # [m] from the learned path: less is not called avoiding
 _FASTEST_TURN = 1.0  # [rad/s] by which an error of the tool's rotation is corrected
-
-
-class Margin(Protocol):
-    """An additional distance that grows with the look-ahead time, such as ``imitarm.perception.CoverageMargin``."""
-
-    def at(self, tau: Any) -> Any:
-        """Return the margin [m] for look-ahead times ``tau`` [s]."""
 
 
 class _Near(NamedTuple):
@@ -93,10 +86,10 @@ class RCAMO(Policy):
         *,
         cost: Literal["distance", "gaussian"] = "distance",
         gains: str | Gains = "critical",
-        margin: Margin | None = None,
+        margin: CoverageMargin | None = None,
         beta: float = 1.0,
         cap: float = 0.01,
-        time_constant: float = 1.0,
+        time_constant: float = 1.5,
         max_acceleration: float = 20.0,
         horizon: int = 12,
         interval: float = 0.05,
@@ -108,7 +101,7 @@ class RCAMO(Policy):
         super().__init__(skill, **options)
         choice(cost, ("distance", "gaussian"), "RCAMO: cost")
         self.gains = Gains.of(gains, "RCAMO")
-        self._margin = margin
+        self._margin = None if margin is None else instance(margin, CoverageMargin, "RCAMO: margin")
         self._beta = finite_number(beta, "RCAMO: beta", at_least=0.0)
         self._cap = finite_number(cap, "RCAMO: cap", "m", at_least=0.0)
         self._tau = finite_number(time_constant, "RCAMO: time_constant", "s", above=0.0)
@@ -117,26 +110,21 @@ class RCAMO(Policy):
         self._arrival = finite_number(arrival, "RCAMO: arrival", "m", above=0.0)
         steps = whole_number(horizon, "RCAMO: horizon", at_least=1, at_most=200)
         self._times = finite_number(interval, "RCAMO: interval", "s", above=0.0) * np.arange(1.0, steps + 1.0)
-        self.least_cost = LeastCost(
-            Response.of(self.gains, self._tau, self._times),
-            finite_number(max_acceleration, "RCAMO: max_acceleration", "m/s^2", above=0.0),
-        )
+        limit = finite_number(max_acceleration, "RCAMO: max_acceleration", "m/s^2", above=0.0)
         spheres = np.zeros((1, 4)) if self.tool_spheres is None else self.tool_spheres
         self._spheres = spheres[:, :3]
         self._tool_radius = float(np.max(np.linalg.norm(spheres[:, :3], axis=1) + spheres[:, 3]))
-        self.obstacle_cost = self._cost(cost, spheres[:, 3])
         forbidden = finite_array(np.reshape(np.asarray(self.forbidden, dtype=float), (-1, 3)), (None, 3), "forbidden")
         self._axes, rest = allowed_axes(forbidden / np.linalg.norm(forbidden, axis=1, keepdims=True))
         self._one_sided = rest @ self._axes.T
-        self._headings = headings(self._axes)
+        response = Response.of(self.gains, self._tau, self._times)
+        obstacle_cost: ObstacleCost = DistanceCost(self.clearance, spheres[:, 3])
+        if cost == "gaussian":
+            obstacle_cost = GaussianCost(self.clearance, spheres[:, 3], stiffness=LeastCost.deviation_weight)
+        self.least_cost = LeastCost(response, obstacle_cost, limit, headings(self._axes))
         self._dmp = _primitive(skill, self.gains)
         self._steps: dict[float, Response] = {}
         self._path: PrimitivePath | None = None
-
-    def _cost(self, name: str, radii: Array) -> ObstacleCost:
-        if name == "distance":
-            return DistanceCost(self.clearance, radii)
-        return GaussianCost(self.clearance, radii, stiffness=self.least_cost.deviation_weight)
 
     # ----- start
 
@@ -164,7 +152,7 @@ class RCAMO(Policy):
         path = self._followed(observation)
         self._phase, self._rate = phase, 1.0
         self._deviation = np.zeros((2, 3))
-        self._deviation[0] = observation.tool_to_base.position - path.position(np.array([phase]))[0]
+        self._deviation[0] = observation.tool_to_base.position - path.position(phase)
         self._scaled = np.zeros(3)
         self._hold = observation.tool_to_base.quaternion
         self._reason = ""
@@ -185,9 +173,8 @@ class RCAMO(Policy):
         if not (
             np.array_equal(goal.position, path.goal.position) and np.array_equal(goal.quaternion, path.goal.quaternion)
         ):
-            here = np.array([self._phase])
             moved = path.to(goal)
-            self._deviation[0] -= (moved.position(here) - path.position(here))[0]
+            self._deviation[0] -= moved.position(self._phase) - path.position(self._phase)
             path = self._path = moved
         return path
 
@@ -201,7 +188,7 @@ class RCAMO(Policy):
         """
         path = self._followed(observation)
         x = observation.tool_to_base.position
-        reference = path.position(np.array([self._phase]))[0] + self._deviation[0]
+        reference = path.position(self._phase) + self._deviation[0]
         lag = x - reference
         away = float(np.sqrt(lag.dot(lag)))
         if away > self._patience:
@@ -211,8 +198,8 @@ class RCAMO(Policy):
         near = self._near(observation, path)
         chosen = self._choose(path, lag, near)
         rate = chosen.rate * max(0.0, 1.0 - (away / self._patience) ** 2)
-        phase = self._advance(rate, chosen.push, dt)
-        moved = path.position(np.array([self._phase]))[0] + self._deviation[0]
+        phase = self._advance(rate, self.least_cost.max_acceleration * chosen.scaled, dt)
+        moved = path.position(self._phase) + self._deviation[0]
         twist = np.empty(6)
         twist[:3] = (moved - reference) / dt - self._gain * lag
         twist[3:] = self._rotation(path, observation.tool_to_base, phase, dt)
@@ -224,51 +211,46 @@ class RCAMO(Policy):
         if one is None:
             one = self._steps[dt] = Response.of(self.gains, self._tau, np.array([dt]))
         before = self._phase
-        self._phase = float(self._phases(rate, np.array([dt]))[0])
-        self._phase = min(max(self._phase, 0.0), 1.0)
-        self._rate = rate + (self._rate - rate) * math.exp(-dt / _RATE_TIME)
+        decay = math.exp(-dt / _RATE_TIME)
+        travelled = rate * dt + (self._rate - rate) * _RATE_TIME * (1.0 - decay)
+        self._phase = min(max(self._phase + travelled / self._dmp.duration_, 0.0), 1.0)
+        self._rate = rate + (self._rate - rate) * decay
         e, v = self._deviation
         self._deviation = np.stack(
             [one.A * e + one.B * v + one.G * push, one.a_rate * e + one.b_rate * v + one.g_rate * push]
         )
         return before
 
-    def _phases(self, rate: float, times: Array) -> Array:
-        """Return the phases at ``times`` (k,) [s] from now, when the phase takes up the speed ``rate``."""
-        transient = (self._rate - rate) * _RATE_TIME * (1.0 - np.exp(times / -_RATE_TIME))
-        return np.asarray(self._phase + (rate * times + transient) / self._dmp.duration_)
+    def _phases(self, rates: Array, times: Array) -> Array:
+        """Return the phases at ``times`` (H,) [s] from now, when the phase takes up speeds (R, 1), shape (R, H)."""
+        transient = _RATE_TIME * (1.0 - np.exp(times / -_RATE_TIME))
+        return np.asarray(self._phase + (rates * times + (self._rate - rates) * transient) / self._dmp.duration_)
 
     def _choose(self, path: PrimitivePath, lag: Array, near: _Near | None) -> Choice:
         if near is None:
-            self._scaled = np.zeros(3)
-            return Choice(np.zeros(3), 1.0, 0.0, None)
-        axes = frame(path.tangent(self._phase), self._axes)
-        directions = self._headings @ axes.T
-        if len(self._one_sided):
-            directions = directions[(directions @ self._one_sided.T <= 1e-9).all(axis=1)]
-        measured = self._deviation.copy()
-        measured[0] += lag
-        free = self.least_cost.response.free(measured)
+            self._scaled = STAY.scaled
+            return STAY
+        free = self.least_cost.response.free(self._deviation)
+        free = free + self.least_cost.response.A[:, None] * lag
 
-        def predict(rate: float) -> Prediction:
-            phases = self._phases(rate, self._times)
+        def predict(rates: Array) -> Prediction:
+            phases = self._phases(rates[:, None], self._times)
             samples = path.nearest(phases)
-            centers = path.position(phases) + free
-            return Prediction(centers[:, None] + self._offsets(path, samples), free, path.precision[samples])
+            centers = (path.positions_at(phases) + free)[:, :, None]
+            if self._spheres.any():
+                centers = centers + self._offsets(path, samples)
+            return Prediction(centers, free, path.precision[samples])
 
-        def cost(points: Array) -> tuple[Array, Array]:
-            return self.obstacle_cost.values(near.obstacles, points)
-
-        scaled = self.least_cost.candidates(directions)
-        chosen = self.least_cost.choose(scaled, self._scaled, predict, cost)
-        self._scaled = chosen.push / self.least_cost.max_acceleration
+        axes = frame(path.tangent(self._phase), self._axes)
+        chosen = self.least_cost.choose(axes, self._one_sided, self._scaled, predict, near.obstacles)
+        self._scaled = chosen.scaled
         return chosen
 
     def _offsets(self, path: PrimitivePath, samples: NDArray[np.intp]) -> Array:
-        """Return the centres of the tool's spheres relative to its tip, shape (H, S, 3) [m]."""
+        """Return the centres of the tool's spheres relative to its tip, shape (R, H, S, 3) [m]."""
         if path.rotations is None:
-            return (self._spheres @ quaternion_to_matrix(self._hold).T)[None]
-        return np.matmul(path.rotations[samples], self._spheres.T).transpose(0, 2, 1)
+            return self._spheres @ quaternion_to_matrix(self._hold).T
+        return np.matmul(path.rotations[samples], self._spheres.T).swapaxes(-1, -2)
 
     def _near(self, observation: Observation, path: PrimitivePath) -> _Near | None:
         """Return the obstacles that may have an effect within the horizon; None if there is none."""
@@ -285,7 +267,8 @@ class RCAMO(Policy):
             gap = np.where(unbounded, distances(packed, x[None, None], [elapsed])[:, 0, 0], gap)
         speed = np.sqrt(np.sum(packed.velocities * packed.velocities, axis=1))
         margin = self._margins(packed.covariances, elapsed)
-        reach = self._tool_radius + self.clearance + _NO_INFLUENCE + self._travel(path) + margin.max(axis=1)
+        influence = self.least_cost.obstacle_cost.influence(packed) + margin.max(axis=1)
+        reach = self._tool_radius + self._travel(path) + influence
         indices = (gap - span * speed <= reach).nonzero()[0]
         if not len(indices):
             return None
@@ -297,13 +280,13 @@ class RCAMO(Policy):
         """Return a bound of the tool's travel within the horizon [m]."""
         response, (e, v) = self.least_cost.response, self._deviation
         own = np.abs(response.A - 1.0).max() * np.sqrt(e.dot(e)) + np.abs(response.B).max() * np.sqrt(v.dot(v))
-        return float(own + response.G.max() * self.least_cost.max_acceleration + path.speed * self._times[-1])
+        return float(own + self.least_cost.travel + path.speed * self._times[-1])
 
     def _margins(self, covariances: Array, elapsed: float) -> Array:
         """Return the additional distance to each of n obstacles at each instant, shape (n, H) [m]."""
         n = len(covariances)
         if self._margin is not None:
-            grown = np.asarray(self._margin.at(elapsed + self._times), dtype=float)
+            grown = self._margin.at(elapsed + self._times)
             return np.broadcast_to(grown, (n, len(self._times)))
         if not covariances.any():
             return np.zeros((n, len(self._times)))
@@ -325,10 +308,9 @@ class RCAMO(Policy):
     def _command(
         self, twist: Array, observation: Observation, near: _Near | None, chosen: Choice, lag: float
     ) -> Command:
-        if near is not None and chosen.nearest is not None:
-            index, gap = chosen.nearest
-            name = observation.scene.name_of(near.indices[index])
-            self._reason = f"{name}, predicted to come within {1e3 * gap:.0f} mm of the tool"
+        if near is not None and chosen.nearest >= 0:
+            name = observation.scene.name_of(near.indices[chosen.nearest])
+            self._reason = f"{name}, predicted to come within {1e3 * chosen.gap:.0f} mm of the tool"
         deviation = float(np.sqrt(self._deviation[0].dot(self._deviation[0])))
         waits = self._rate < _STANDS and self._phase < 1.0
         if waits and chosen.rate < _STANDS:
@@ -337,7 +319,7 @@ class RCAMO(Policy):
         if waits or (self._phase >= 1.0 and lag >= 0.5 * self._patience):
             reason = f"the tool is {1e3 * lag:.0f} mm behind its motion"
             return Command(twist, progress=self._phase, status=Status.WAITING, reason=reason)
-        if self._phase >= 1.0 and deviation > self._arrival and chosen.push.any():
+        if self._phase >= 1.0 and deviation > self._arrival and chosen.scaled.any():
             reason = f"the goal is not free because of {self._reason}"
             return Command(twist, progress=self._phase, status=Status.WAITING, reason=reason)
         if self._reason and (deviation > _DISPLACED or chosen.rate < 1.0):
