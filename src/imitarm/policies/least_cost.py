@@ -306,13 +306,14 @@ class LeastCost:
         """Return speed, candidate, cost, nearest obstacle and its distance of the best one; None if above ``bound``."""
         n_rates, H, S, _ = prediction.centers.shape
         n, shape = len(obstacles.packed), (n_rates, len(obstacles.packed), H, S)
+        centers = prediction.centers.reshape(-1, 3)
         every = _Pairs.all(*shape)
-        centers = prediction.centers.reshape(-1, 3).T[:, every.center]
-        gaps = self.obstacle_cost.gaps(obstacles, every.groups, centers[:, :, None])
-        free_gaps = gaps[:, 0].reshape(shape)
+        still = centers[every.center], np.zeros(len(every.key)), scaled[:1]
+        gaps = self.obstacle_cost.gaps(obstacles, every.groups, *still)
+        free_gaps = gaps.reshape(shape)
         costs = np.full((n_rates, len(scaled)), math.inf)
-        values = self.obstacle_cost.values(obstacles, every.groups, centers[:, :, None], gaps.copy())
-        free = values.reshape(shape).max(axis=3).sum(axis=1) @ self._weights
+        values = self.obstacle_cost.values(obstacles, every.groups, *still, gaps).reshape(shape)
+        free = np.add.reduce(values[..., 0] if S == 1 else values.max(axis=3), axis=1) @ self._weights
         costs[:, 0] = smooth[:, 0] + free
         least = min(bound, float(costs[:, 0].min()))
         columns = (smooth.min(axis=0) <= least + _TIED).nonzero()[0]
@@ -340,12 +341,10 @@ class LeastCost:
         if S > 1:  # a sphere that can't become the nearest one has no effect
             near &= free_gaps <= free_gaps.min(axis=3, keepdims=True) + 2.0 * gains
         pairs = _Pairs.where(near)
-        reach = self._gains[pairs.groups.instant]
-        centers = prediction.centers.reshape(-1, 3).T[:, pairs.center]
-        points = centers[:, :, None] + reach[:, None] * scaled.T[:, None]
-        gaps = self.obstacle_cost.gaps(obstacles, pairs.groups, points)
-        values = self.obstacle_cost.values(obstacles, pairs.groups, points, gaps.copy())
         rate, groups = pairs.rate, pairs.groups
+        moved = prediction.centers.reshape(-1, 3)[pairs.center], self._gains[groups.instant], scaled
+        gaps = self.obstacle_cost.gaps(obstacles, groups, *moved)
+        values = self.obstacle_cost.values(obstacles, groups, *moved, gaps)
         if S > 1 and len(rate):
             first = np.flatnonzero(np.diff(pairs.key, prepend=-1))
             values = np.maximum.reduceat(values, first, axis=0)

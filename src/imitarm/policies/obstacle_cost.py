@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import quaternion_to_matrix
-from imitarm.scene.distances import KINDS, PackedObstacles, distances_and_gradients, group_distances
+from imitarm.scene.displacements import displaced_distances
+from imitarm.scene.distances import KINDS, PackedObstacles, distances_and_gradients
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -64,20 +65,33 @@ class ObstacleCost(ABC):
     def influence(self, packed: PackedObstacles) -> Array:
         """Return the distances between tool and obstacles beyond which the cost is negligible, shape (n,) [m]."""
 
-    def gaps(self, obstacles: PredictedObstacles, groups: Groups, points: Array) -> Array:
+    def gaps(self, obstacles: PredictedObstacles, groups: Groups, origins: Array, scales: Array, moves: Array) -> Array:
         """Return the distances between the spheres and the obstacles, less the margin, shape (k, C) [m].
+
+        In candidate c, the centre of the sphere of pair k is ``origins[k] + scales[k] moves[c]``.
 
         Args:
             obstacles: n obstacles at H instants.
             groups: k pairs.
-            points: centre of the sphere of each pair for C candidates, one row for each axis, shape (3, k, C) [m].
+            origins: centres of the spheres, shape (k, 3) [m].
+            scales: shape (k,) [m].
+            moves: displacements of the candidates, shape (C, 3).
         """
-        less = self.radii[groups.sphere] + obstacles.margin[groups.obstacle, groups.instant]
         times = obstacles.times[groups.instant]
-        return group_distances(obstacles.packed, groups.obstacle, points, times) - less[:, None]
+        gaps = displaced_distances(obstacles.packed, groups.obstacle, times, origins, scales, moves)
+        gaps -= (self.radii[groups.sphere] + obstacles.margin[groups.obstacle, groups.instant])[:, None]
+        return gaps
 
     @abstractmethod
-    def values(self, obstacles: PredictedObstacles, groups: Groups, points: Array, gaps: Array) -> Array:
+    def values(
+        self,
+        obstacles: PredictedObstacles,
+        groups: Groups,
+        origins: Array,
+        scales: Array,
+        moves: Array,
+        gaps: Array,
+    ) -> Array:
         """Return the cost of each pair, shape (k, C).
 
         The cost of a tool of several spheres is the largest cost of its spheres.
@@ -85,13 +99,15 @@ class ObstacleCost(ABC):
         Args:
             obstacles: n obstacles at H instants.
             groups: k pairs.
-            points: see :meth:`gaps`.
-            gaps: result of :meth:`gaps`; the method may overwrite it.
+            origins: see :meth:`gaps`.
+            scales: see :meth:`gaps`.
+            moves: see :meth:`gaps`.
+            gaps: result of :meth:`gaps`.
         """
 
     @abstractmethod
     def gradients(self, obstacles: PredictedObstacles, groups: Groups, points: Array) -> Array:
-        """Return the gradient of :meth:`values` with respect to the points, shape (3, k, C) [1/m]."""
+        """Return the gradient of the cost of each pair at ``points`` (k, 3) [m], shape (k, 3) [1/m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,27 +130,30 @@ class DistanceCost(ObstacleCost):
         """Return the distances beyond which the cost is negligible, shape (n,) [m]."""
         return np.full(len(packed), self.clearance + _NEGLIGIBLE * self.width)
 
-    def values(self, obstacles: PredictedObstacles, groups: Groups, points: Array, gaps: Array) -> Array:
+    def values(
+        self,
+        obstacles: PredictedObstacles,
+        groups: Groups,
+        origins: Array,
+        scales: Array,
+        moves: Array,
+        gaps: Array,
+    ) -> Array:
         """Return the cost of each pair, shape (k, C); see :class:`ObstacleCost`."""
-        del obstacles, groups, points
-        return self._cost(gaps)
+        del obstacles, groups, origins, scales, moves
+        exponent = gaps - self.clearance
+        exponent *= -1.0 / self.width
+        np.minimum(exponent, _LARGEST_EXPONENT, out=exponent)
+        return np.asarray(np.exp(exponent, out=exponent))
 
     def gradients(self, obstacles: PredictedObstacles, groups: Groups, points: Array) -> Array:
-        """Return the gradient of the costs, shape (3, k, C) [1/m]; see :class:`ObstacleCost`."""
-        cost = self._cost(self.gaps(obstacles, groups, points))
-        normals = np.empty_like(points)
-        for k, (obstacle, instant) in enumerate(zip(groups.obstacle, groups.instant, strict=True)):
-            times = obstacles.times[instant : instant + 1]
-            normals[:, k] = distances_and_gradients(obstacles.packed, points[None, :, k].transpose(0, 2, 1), times)[1][
-                obstacle, 0
-            ].T
-        return np.asarray(-cost / self.width * normals)
-
-    def _cost(self, gaps: Array) -> Array:
-        gaps -= self.clearance
-        gaps *= -1.0 / self.width
-        np.minimum(gaps, _LARGEST_EXPONENT, out=gaps)
-        return np.asarray(np.exp(gaps, out=gaps))
+        """Return the gradient of the cost of each pair, shape (k, 3) [1/m]; see :class:`ObstacleCost`."""
+        still = np.zeros(len(points)), np.zeros((1, 3))
+        gaps = self.gaps(obstacles, groups, points, *still)
+        cost = self.values(obstacles, groups, points, *still, gaps)
+        times = obstacles.times[groups.instant]
+        normals = distances_and_gradients(obstacles.packed, points[:, None], times)[1][:, :, 0]
+        return np.asarray(-cost / self.width * normals[groups.obstacle, np.arange(len(points))])
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,26 +198,34 @@ class GaussianCost(ObstacleCost):
         height = height * np.prod(lengths, axis=1) / np.sqrt(np.linalg.det(spread))
         return height, np.asarray(np.linalg.inv(spread), dtype=float)
 
-    def _offsets(self, obstacles: PredictedObstacles, groups: Groups, points: Array) -> Array:
-        """Return the vectors from the obstacles' centres to the points, shape (3, k, C) [m]."""
+    def _centers(self, obstacles: PredictedObstacles, groups: Groups) -> Array:
+        """Return the predicted centres of the obstacles, shape (k, 3) [m]."""
         packed, i = obstacles.packed, groups.obstacle
-        centers = packed.positions[i] + obstacles.times[groups.instant, None] * packed.velocities[i]
-        return np.asarray(points - centers.T[:, :, None])
+        return packed.positions[i] + obstacles.times[groups.instant, None] * packed.velocities[i]
 
-    def values(self, obstacles: PredictedObstacles, groups: Groups, points: Array, gaps: Array) -> Array:
+    def values(
+        self,
+        obstacles: PredictedObstacles,
+        groups: Groups,
+        origins: Array,
+        scales: Array,
+        moves: Array,
+        gaps: Array,
+    ) -> Array:
         """Return the cost of each pair, shape (k, C); see :class:`ObstacleCost`."""
         del gaps
         height, precision = self._shapes(obstacles, groups)
-        offset = self._offsets(obstacles, groups, points)
-        square = np.einsum("ikc,kij,jkc->kc", offset, precision, offset, optimize=True)
+        offset = (origins - self._centers(obstacles, groups))[:, None] + scales[:, None, None] * moves
+        square = np.sum(np.matmul(offset, precision) * offset, axis=2)
         return np.asarray(height[:, None] * np.exp(-0.5 * square))
 
     def gradients(self, obstacles: PredictedObstacles, groups: Groups, points: Array) -> Array:
-        """Return the gradient of the costs, shape (3, k, C) [1/m]; see :class:`ObstacleCost`."""
+        """Return the gradient of the cost of each pair, shape (k, 3) [1/m]; see :class:`ObstacleCost`."""
         height, precision = self._shapes(obstacles, groups)
-        offset = self._offsets(obstacles, groups, points)
-        pull = np.einsum("kij,jkc->ikc", precision, offset)
-        return np.asarray(-height[:, None] * np.exp(-0.5 * np.sum(offset * pull, axis=0)) * pull)
+        offset = points - self._centers(obstacles, groups)
+        pull = np.matmul(precision, offset[:, :, None])[..., 0]
+        cost = height * np.exp(-0.5 * np.sum(offset * pull, axis=1))
+        return np.asarray(-cost[:, None] * pull)
 
 
 def _semi_axes(packed: PackedObstacles) -> Array:

@@ -5,7 +5,6 @@ For a single obstacle, use ``Obstacle.signed_distance``. The distance formulas a
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -42,7 +41,7 @@ _ROWS = (
 _OF_THE_POSE = frozenset(("positions", "_frames", "_ahead", "_shapes"))
 
 
-class _Members(NamedTuple):
+class Members(NamedTuple):
     """The obstacles of one ``PackedObstacles`` that share one distance formula."""
 
     formula: Formula
@@ -190,23 +189,23 @@ class PackedObstacles:
         return np.array([_bounding_radius(KINDS[kind], size, polytope) for kind, size, polytope in rows])
 
     @cached_property
-    def _sorted(self) -> tuple[Indices, list[_Members]]:
+    def _sorted(self) -> tuple[Indices, list[Members]]:
         """The order of the obstacles when grouped by family, and the families; every hull is a separate family."""
         names = [KINDS[kind] for kind in self.kinds.tolist()]
         merged = any(name in SLABS.kinds for name in names)  # then spheres and capsules are taken as rounded boxes
         order: list[int] = []
-        families: list[_Members] = []
+        families: list[Members] = []
         for family in FAMILIES:
             kinds = family.kinds + (ROUNDS.kinds if merged and family is SLABS else ())
             members = [] if merged and family is ROUNDS else [i for i, name in enumerate(names) if name in kinds]
             if members:
                 places = slice(len(order), len(order) + len(members))
                 parameters = family.prepare([names[i] for i in members], self.sizes[members])
-                families.append(_Members(family.formula, places, parameters))
+                families.append(Members(family.formula, places, parameters))
                 order += members
         for i, polytope in enumerate(self.polytopes):
             if polytope is not None:
-                families.append(_Members(polytope.formula, slice(len(order), len(order) + 1), ()))
+                families.append(Members(polytope.formula, slice(len(order), len(order) + 1), ()))
                 order.append(i)
         return np.array(order, dtype=np.intp), families
 
@@ -318,7 +317,7 @@ def near_pairs(packed: PackedObstacles, points: Array, reach: Array) -> NearPair
     q = every.reshape(3, -1).take(flat, axis=1)
     if len(packed._sorted[1]) == 1:
         formula, _, parameters = packed._sorted[1][0]
-        distance, normal = formula(q, True, *_take(parameters, place))
+        distance, normal = formula(q, True, *take(parameters, place))
     else:
         distance, normal = np.empty(len(flat)), np.empty((3, len(flat)))
         starts = np.searchsorted(place, [family.places.start for family in packed._sorted[1]]).tolist()
@@ -327,7 +326,7 @@ def near_pairs(packed: PackedObstacles, points: Array, reach: Array) -> NearPair
         ):
             if a < b:
                 column = place[a:b] - places.start
-                distance[a:b], normal[:, a:b] = formula(q[:, a:b], True, *_take(parameters, column))
+                distance[a:b], normal[:, a:b] = formula(q[:, a:b], True, *take(parameters, column))
     near = (distance <= reach.take(point)).nonzero()[0]
     if not len(near):
         return None
@@ -337,46 +336,6 @@ def near_pairs(packed: PackedObstacles, points: Array, reach: Array) -> NearPair
     if not frames.upright:
         normal = np.einsum("jk,kji->ik", normal, frames.to_local.take(place, axis=0))
     return NearPairs(packed._sorted[0][place], point, distance, normal)
-
-
-def group_distances(packed: PackedObstacles, members: Indices, points: Array, times: Array) -> Array:
-    """Return the distances of groups of points; each group has its own obstacle and its own time.
-
-    The arguments are not checked, to save time in control steps.
-
-    Args:
-        packed: obstacles at their reference time.
-        members: index of the obstacle of each group, shape (k,).
-        points: points of each group in the base frame, one row for each axis, shape (3, k, m) [m].
-        times: time of each group, after the obstacles' reference time, shape (k,) [s].
-
-    Returns:
-        Shape (k, m) [m], negative inside.
-    """
-    if packed.rotating:
-        distance = np.empty(points.shape[1:])
-        for time in np.unique(times).tolist():
-            now = (times == time).nonzero()[0]
-            moved = dataclasses.replace(packed.after(time), angular_velocities=np.zeros((len(packed), 3)))
-            distance[now] = group_distances(moved, members[now], points[:, now], np.zeros(len(now)))
-        return distance
-    frames, families = packed._frames, packed._sorted[1]
-    place = packed._place_of[members]
-    center = frames.center[:, place, 0] + frames.velocity[:, place, 0] * times
-    if frames.upright:
-        q = points - center[:, :, None]
-    else:
-        q = np.matmul(frames.to_local[place], points.transpose(1, 0, 2)).transpose(1, 0, 2) - center[:, :, None]
-    if len(families) == 1:
-        formula, _, parameters = families[0]
-        return formula(q, False, *_every(_take(parameters, place)))[0]
-    distance = np.empty(points.shape[1:])
-    for formula, places, parameters in families:
-        rows = ((place >= places.start) & (place < places.stop)).nonzero()[0]
-        if len(rows):
-            taken = _every(_take(parameters, place[rows] - places.start))
-            distance[rows] = formula(q[:, rows], False, *taken)[0]
-    return distance
 
 
 def _evaluate(
@@ -422,10 +381,10 @@ def _at_once(packed: PackedObstacles, points: Array, times: Array | None, gradie
     families = packed._sorted[1]
     if len(families) == 1 and not gradient:  # in their own order
         formula, _, parameters = families[0]
-        return formula(q, False, *_every(parameters))
+        return formula(q, False, *every(parameters))
     distance, gradients = np.empty((n, m)), np.empty((n, m, 3)) if gradient else None
     for formula, places, parameters in packed._sorted[1]:
-        part, normal = formula(q[:, places], gradient, *_every(parameters))
+        part, normal = formula(q[:, places], gradient, *every(parameters))
         distance[packed._sorted[0][places]] = part
         if gradients is not None and normal is not None:
             for i, place in enumerate(range(places.start, places.stop)):
@@ -433,12 +392,12 @@ def _at_once(packed: PackedObstacles, points: Array, times: Array | None, gradie
     return distance, gradients
 
 
-def _every(parameters: Parameters | list[Array | None]) -> list[Array | None]:
+def every(parameters: Parameters | list[Array | None]) -> list[Array | None]:
     """Return the parameters of all obstacles of a family, with a last axis of length 1, to combine them with points."""
     return [None if p is None else p[..., None] for p in parameters]
 
 
-def _take(parameters: Parameters, members: Indices) -> list[Array | None]:
+def take(parameters: Parameters, members: Indices) -> list[Array | None]:
     """Return the parameters of one obstacle of a family for each point; ``members`` are the obstacles' indices."""
     return [None if p is None else p.take(members, axis=-1) for p in parameters]
 
