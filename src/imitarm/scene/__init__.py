@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from imitarm.scene.convex_hull import ConvexHull
+from imitarm.scene.displacements import displaced_distances
 from imitarm.scene.edged import Box, Cone, Cylinder, HalfSpace, standard_fixtures
 from imitarm.scene.motion import MovingScene, Track
 from imitarm.scene.obstacle import Obstacle
@@ -28,6 +29,7 @@ __all__ = [
     "Scene",
     "Sphere",
     "Track",
+    "displaced_distances",
     "load_moving_scene",
     "load_scene",
     "save_scene",
