@@ -113,7 +113,7 @@ class SensorModel:
             if missed[i] or np.linalg.norm(positions[i]) > self.reach or self._hidden(int(i), stamp):
                 continue
             measured = _anonymous(shapes[i]).placed(positions[i] + errors[i], quaternions[i], np.zeros(3), np.zeros(3))
-            seen.append(Detection(measured, covariance, shapes[i].kind))
+            seen.append(Detection(measured, covariance))
         return Frame(stamp, stamp + self.latency, tuple(seen))
 
     def arrived(self, truth: Scene | MovingScene, since: float, until: float) -> Iterator[Frame]:

@@ -27,6 +27,8 @@ POLICIES: Registry[type[Policy]] = Registry(
         "dmp-potential": "imitarm.policies.baselines.dmp_potential:DMPPotential",
         "gmm-dmp": "imitarm.policies.baselines.gmm_dmp:GMMDMP",
         "dmp-ann": "imitarm.policies.baselines.dmp_ann:DMPANN",
+        "dmp-barrier": "imitarm.policies.baselines.dmp_barrier:DMPBarrier",
+        "stop-only": "imitarm.policies.baselines.stop_only:StopOnly",
         "barrier": "imitarm.policies.baselines.barrier:Barrier",
         "elastic-band": "imitarm.policies.baselines.elastic_band:ElasticBand",
         "gmm-irl": "imitarm.policies.baselines.gmm_irl:GmmIrl",

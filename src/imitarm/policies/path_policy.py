@@ -150,10 +150,7 @@ class PathPolicy(Policy):
         Raises:
             InfeasibleError: when the method knows that it has no solution; the message says why.
         """
-        away = observation.tool_to_base.error_to(self.skill.start_)
-        if not self.skill.gmr_.has_orientation_:
-            away = away[:3]
-        start = None if np.linalg.norm(away) <= self._same_start else observation.tool_to_base
+        start = self.start_of(observation)
         self.motion = None
         self.motion = self.plan_motion(observation.scene.now(observation.time), start, observation.state)
         path, joints = self.motion.trajectory, self.motion.joints
@@ -167,6 +164,13 @@ class PathPolicy(Policy):
         self._hold = observation.tool_to_base
         self._began = observation.time
         self._phase, self._void = 0.0, ""
+
+    def start_of(self, observation: Observation) -> Pose | None:
+        """Return the measured pose of the tool; None if it is the learned start."""
+        away = observation.tool_to_base.error_to(self.skill.start_)
+        if not self.skill.gmr_.has_orientation_:
+            away = away[:3]
+        return None if np.linalg.norm(away) <= self._same_start else observation.tool_to_base
 
     @property
     def plan(self) -> Adaptation | None:

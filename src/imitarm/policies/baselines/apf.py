@@ -16,6 +16,7 @@ from imitarm.policies.baselines.potential_field import (
     repulsive_force,
     repulsive_potential,
 )
+from imitarm.policies.baselines.reaction import Reaction
 from imitarm.policies.component_path import quintic_step
 from imitarm.scene.scene import Scene
 from imitarm.skills.skill import Skill
@@ -76,6 +77,15 @@ class APF(BaselinePolicy):
         self.cap = finite_number(cap, "APF: cap", "m", above=0.0)
         self.speed = finite_number(speed, "APF: speed", above=0.0)
 
+    def field(self, nominal: Trajectory, gaps: ToolGaps, *, moving: bool) -> _Field:
+        """Return the potential of a scene; ``moving`` says whether obstacles move."""
+        stiffness = self.speed * max(nominal.path_length / nominal.duration, 1e-6) / self.cap
+        return _Field(self, gaps, nominal.positions[-1], stiffness, moving=moving)
+
+    def reaction(self, nominal: Trajectory, position: Array, velocity: Array, fraction: float) -> Reaction:
+        """Return the motion along the forces, one control period at a time."""
+        return _FieldReaction(self, nominal, position, velocity, fraction)
+
     def tool_path(self, nominal: Trajectory, gaps: ToolGaps, scene: Scene) -> tuple[Array, Array]:
         """Return the path along the forces, from the start of ``nominal`` to its goal.
 
@@ -84,8 +94,7 @@ class APF(BaselinePolicy):
         """
         x, duration = nominal.positions[0].copy(), nominal.duration
         speeds = np.linalg.norm(np.diff(nominal.positions, axis=0), axis=1) / np.diff(nominal.times)
-        stiffness = self.speed * max(nominal.path_length / duration, 1e-6) / self.cap
-        field = _Field(self, gaps, nominal.positions[-1], stiffness, moving=not scene.packed.still)
+        field = self.field(nominal, gaps, moving=not scene.packed.still)
         path = [x]
         for k in range(round(_LONGEST * duration / _STEP)):
             time = k * _STEP
@@ -108,6 +117,27 @@ class APF(BaselinePolicy):
                 f"choose another repulsion or influence, or another policy"
             )
         return np.linspace(0.0, _STEP * (len(path) - 1), len(path)), np.stack(path)
+
+
+class _FieldReaction(Reaction):
+    """The forces of the observed obstacles, one control period at a time."""
+
+    def __init__(self, policy: APF, nominal: Trajectory, position: Array, velocity: Array, fraction: float) -> None:
+        super().__init__(nominal, position, velocity, fraction)
+        self._policy = policy
+        speeds = np.linalg.norm(np.diff(nominal.positions, axis=0), axis=1) / np.diff(nominal.times)
+        self._fastest = float(speeds.max())
+
+    def step(self, scene: Scene, dt: float) -> None:
+        """Move along the forces."""
+        field = self._policy.field(self.nominal, ToolGaps(scene, self._policy.tool_spheres), moving=True)
+        distance, normal = field.distances(self.position, 0.0)
+        force = field.force(self.position, distance, normal)
+        step = dt / self.nominal.duration
+        most = self._fastest * float(quintic_step((self.fraction + step) / _START))
+        move = force * (dt * min(1.0, most / max(float(np.linalg.norm(force)), 1e-12)))
+        self.position = self.position + field.downhill(self.position, move, distance, 0.0)
+        self.fraction += step
 
 
 class _Field(NamedTuple):

@@ -9,10 +9,14 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from imitarm.command import Command, Status
+from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmState
 from imitarm.kinematics.pose import Pose
+from imitarm.policies.baselines.reaction import Reaction, changed
 from imitarm.policies.component_path import ComponentPath
 from imitarm.policies.path_policy import PathPlan, PathPolicy
+from imitarm.policies.policy import Observation
 from imitarm.scene.distances import distances, distances_and_gradients
 from imitarm.scene.scene import Scene
 from imitarm.skills.skill import Skill
@@ -20,6 +24,10 @@ from imitarm.trajectory import Trajectory
 from imitarm.validation import finite_array
 
 Array = NDArray[np.float64]
+
+_NEARLY = 0.98  # fraction of the duration after which a motion may have arrived
+_NEAR, _SLOW = 5e-3, 3e-3  # [m], [m/s] a tool that rests so near the goal has arrived, as in a planned motion
+_BESIDE = 2e-3  # [m] from the learned path: less is not called avoiding
 
 
 class ToolGaps:
@@ -66,6 +74,10 @@ class BaselinePolicy(PathPolicy):
 
     A subclass implements :meth:`tool_path`. The orientation of the tool is the learned one at equal phases.
 
+    If the subclass also implements :meth:`reaction`, the method reacts to obstacles that move, appear or disappear.
+    From then on, its equations are integrated one control period at a time, with the obstacles as they are observed,
+    and nothing is refused. In a scene that stands still, the path is planned once.
+
     Args:
         skill: skill to reproduce.
         options: arguments of :class:`~imitarm.policies.path_policy.PathPolicy`.
@@ -82,6 +94,19 @@ class BaselinePolicy(PathPolicy):
         self._path = ComponentPath.of_skill(skill)
         directions = finite_array(np.reshape(np.asarray(self.forbidden, dtype=float), (-1, 3)), (None, 3), "forbidden")
         self._forbidden = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        self._reaction: Reaction | None = None
+
+    def reaction(self, nominal: Trajectory, position: Array, velocity: Array, fraction: float) -> Reaction | None:
+        """Return the motion for a scene that changes; None if the method only plans.
+
+        Args:
+            nominal: the learned path between the start and the goal of this motion, 200 samples.
+            position: measured position of the tool, shape (3,) [m].
+            velocity: velocity of the tool, shape (3,) [m/s].
+            fraction: fraction of the duration that has passed.
+        """
+        del nominal, position, velocity, fraction
+        return None
 
     @abstractmethod
     def tool_path(self, nominal: Trajectory, gaps: ToolGaps, scene: Scene) -> tuple[Array, Array]:
@@ -113,6 +138,70 @@ class BaselinePolicy(PathPolicy):
             _, quaternions = nominal.at(nominal.times[0] + times / times[-1] * nominal.duration)
         plan = PathPlan.beside(nominal, Trajectory(times, positions, quaternions))
         return replace(plan, only_on_schedule=self.predicts and not scene.packed.still)
+
+    def reset(self, observation: Observation) -> None:
+        """Plan the path if the scene stands still; else begin to react.
+
+        Raises:
+            InfeasibleError: when the method plans, and knows that it has no solution; the message says why.
+        """
+        scene = observation.scene.now(observation.time)
+        self._observed, self._reaction, self._last = scene.packed, None, np.zeros(3)
+        self._nominal = self._path.between(self.skill, self.start_of(observation), scene.goal).nominal
+        if not scene.packed.still and self._reacts(observation, 0.0):
+            self.motion = PathPlan.beside(self._nominal, self._nominal)
+            self._hold, self._began = observation.tool_to_base, observation.time
+            self._phase, self._void = 0.0, ""
+            return
+        super().reset(observation)
+
+    def step(self, observation: Observation, dt: float) -> Command:
+        """Return the command that follows the planned path, or reacts to the observed obstacles.
+
+        Raises:
+            InputError: when ``reset`` was not called.
+        """
+        if self.motion is None:
+            raise InputError(f"{type(self).__name__}.step: call reset(observation) first")
+        scene = observation.scene.now(observation.time)
+        if self._reaction is None and changed(self._observed, scene.packed):
+            self._reacts(observation, (observation.time - self._began) / self._nominal.duration)
+        if self._reaction is None:
+            command = super().step(observation, dt)
+        else:
+            command = self._reacting(self._reaction, observation, scene, dt)
+        self._last = command.twist[:3]
+        return command
+
+    def finished(self, observation: Observation) -> bool:
+        """Return whether the motion has arrived at its goal."""
+        if self._reaction is None:
+            return super().finished(observation)
+        away = float(np.linalg.norm(observation.tool_to_base.position - self._reaction.goal))
+        rests = float(np.linalg.norm(self._reaction.velocity)) < _SLOW
+        return self._reaction.fraction >= _NEARLY and (away < self._arrival or (away < _NEAR and rests))
+
+    def _reacts(self, observation: Observation, fraction: float) -> bool:
+        """Begin to react, and return whether the method can."""
+        self._reaction = self.reaction(self._nominal, observation.tool_to_base.position, self._last, fraction)
+        return self._reaction is not None
+
+    def _reacting(self, motion: Reaction, observation: Observation, scene: Scene, dt: float) -> Command:
+        """Return the command of a method that reacts: its velocity, and feedback to where the tool should be."""
+        tool = observation.tool_to_base
+        lag = motion.position - tool.position
+        if float(np.linalg.norm(lag)) > self._patience:  # the robot could not follow: go on from where it is
+            motion.position, lag = tool.position.copy(), np.zeros(3)
+        velocity = motion.advance(scene, dt) + self._gain * lag
+        end = min(motion.fraction, 1.0)
+        _, learned = self._nominal.at([self._nominal.times[0] + end * self._nominal.duration])
+        quaternion = self._hold.quaternion if learned is None else learned[0]
+        turning = self._gain * tool.error_to(Pose(tool.position, quaternion))[3:]
+        beside = float(np.linalg.norm(motion.position - motion.learned(motion.fraction)))
+        status = (Status.NOMINAL, "")
+        if beside > _BESIDE and len(scene.packed):
+            status = Status.AVOIDING, f"the tool is {1e3 * beside:.0f} mm from the learned path because of an obstacle"
+        return Command(np.concatenate([velocity, turning]), progress=end, status=status[0], reason=status[1])
 
     def allowed(self, vectors: Array) -> Array:
         """Return forces or velocities, shape (..., 3), without their parts in forbidden directions."""

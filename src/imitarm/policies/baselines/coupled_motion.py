@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from typing import Any, NamedTuple
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from imitarm.errors import InfeasibleError
 from imitarm.policies.baselines.baseline_policy import BaselinePolicy, ToolGaps
+from imitarm.policies.baselines.reaction import Reaction
 from imitarm.scene.distances import PackedObstacles
 from imitarm.scene.scene import Scene
 from imitarm.skills.dynamical_systems import DECAY, propagator, targets_by_step
@@ -41,6 +43,7 @@ class MotionState(NamedTuple):
         reach: distance from the tool's tip to the closest point of each obstacle; at least 5 mm, shape (n,) [m].
         normal: outward normals at the closest points, shape (n, 3); the closest point is ``x - reach normal``.
         relative: v minus the velocity of the closest point times T, shape (n, 3) [m].
+        gap: distance from the tool to each obstacle, minus the required clearance; may be negative, shape (n,) [m].
     """
 
     position: Array
@@ -52,6 +55,12 @@ class MotionState(NamedTuple):
     reach: Array
     normal: Array
     relative: Array
+    gap: Array
+
+    @property
+    def velocity_of_obstacles(self) -> Array:
+        """Velocity of the closest point of each obstacle, times T, shape (n, 3) [m]."""
+        return self.velocity - self.relative
 
 
 class CoupledMotion(BaselinePolicy):
@@ -81,11 +90,33 @@ class CoupledMotion(BaselinePolicy):
     def __init__(self, skill: Skill, *, max_acceleration: float = 10.0, **options: Any) -> None:
         super().__init__(skill, **options)
         name = type(self).__name__
-        self._limit = finite_number(max_acceleration, f"{name}: max_acceleration", "m/s^2", above=0.0)
+        self.max_acceleration = finite_number(max_acceleration, f"{name}: max_acceleration", "m/s^2", above=0.0)
 
     @abstractmethod
     def term(self, state: MotionState) -> Array:
         """Return the coupling term Phi at a state, the sum over all obstacles, shape (3,) [m]."""
+
+    def bounded_term(self, state: MotionState, limit: float) -> Array:
+        """Return the coupling term without its forbidden part and within ``limit`` [m], shape (3,) [m]."""
+        phi = self.allowed(self.term(state))
+        size = float(np.sqrt(phi.dot(phi)))
+        return phi * (limit / size) if size > limit else phi
+
+    def constrained(self, before: Array, after: Array, state: MotionState, step: float) -> Array:
+        """Return the state after a step; a subclass may change it.
+
+        Args:
+            before: [x; T x'] before the step, shape (2, 3) [m].
+            after: the same after the step, from the equation.
+            state: state before the step, with the obstacles.
+            step: length of the step, as a fraction of the duration.
+        """
+        del before, state, step
+        return after
+
+    def reaction(self, nominal: Trajectory, position: Array, velocity: Array, fraction: float) -> Reaction:
+        """Return the motion of the spring, one control period at a time."""
+        return _CoupledReaction(self, nominal, position, velocity, fraction)
 
     def target(self, nominal: Trajectory, fractions: Array) -> Array:
         """Return the target of the spring, shape (n, 3) [m].
@@ -116,15 +147,13 @@ class CoupledMotion(BaselinePolicy):
         drives = one.drive @ np.moveaxis(targets_by_step(one, targets), 0, 1)
         learned = nominal.at(np.minimum(nominal.times[0] + T / n * np.arange(n_steps), nominal.times[-1]))[0]
         z = np.stack([nominal.positions[0], self.start_velocity()])
-        path, limit, slow = [z[0]], self._limit * T * T, _SLOW * nominal.path_length
+        path, limit, slow = [z[0]], self.max_acceleration * T * T, _SLOW * nominal.path_length
         for k in range(n_steps):
             if k >= n and _has_arrived(path, z[1], goal, n // 4, slow):
                 break
-            phi = self.allowed(self.term(surroundings.state(z, k / n, learned[k])))
-            size = float(np.sqrt(phi.dot(phi)))
-            if size > limit:
-                phi = phi * (limit / size)
-            z = one.transition.dot(z) + drives[k] + one.push[:, None] * phi
+            state = surroundings.state(z, k / n, learned[k])
+            phi = self.bounded_term(state, limit)
+            z = self.constrained(z, one.transition.dot(z) + drives[k] + one.push[:, None] * phi, state, 1.0 / n)
             path.append(z[0])
         away = float(np.linalg.norm(z[0] - goal))
         if away > _NEAR:
@@ -145,6 +174,51 @@ def _has_arrived(path: list[Array], velocity: Array, goal: Array, quarter: int, 
     )
 
 
+class _CoupledReaction(Reaction):
+    """The equation of :class:`CoupledMotion`, one control period at a time."""
+
+    def __init__(
+        self, policy: CoupledMotion, nominal: Trajectory, position: Array, velocity: Array, fraction: float
+    ) -> None:
+        super().__init__(nominal, position, velocity, fraction)
+        self.policy, self._steps, self._dt = policy, 0, 0.0
+        if fraction == 0.0:
+            self.velocity = policy.start_velocity() / nominal.duration
+
+    def step(self, scene: Scene, dt: float) -> None:
+        """Move by one step of the spring, with the coupling term of the observed obstacles."""
+        policy, T = self.policy, self.nominal.duration
+        if dt != self._dt:
+            self._prepare(dt)
+        k = min(self._steps, len(self._drives) - 1)
+        around = Surroundings(ToolGaps(scene, policy.tool_spheres), scene.packed, policy.clearance, T)
+        z = np.stack([self.position, T * self.velocity])
+        state = around.state(z, self.fraction, self.learned(self.fraction), 0.0)
+        phi = policy.bounded_term(state, policy.max_acceleration * T * T)
+        z = policy.constrained(
+            z, self._one.transition.dot(z) + self._drives[k] + self._one.push[:, None] * phi, state, dt / T
+        )
+        self.position, self._end = z[0], z[1] / T
+        self._steps, self.fraction = self._steps + 1, self.fraction + dt / T
+
+    def advance(self, scene: Scene, dt: float) -> Array:
+        """Return the mean velocity of the step; the velocity at its end belongs to the state of the spring."""
+        before = self.position
+        self.step(scene, dt)
+        self.velocity = self._end
+        return np.asarray((self.position - before) / dt)
+
+    def _prepare(self, dt: float) -> None:
+        """Compute what the target adds to the spring in each period, from now to three times the duration."""
+        policy, step = self.policy, dt / self.nominal.duration
+        self._dt, self._steps = dt, 0
+        self._one = propagator(policy.skill.dmp_.gains_, step, policy.skill.dmp_.n_basis)
+        n = max(1, math.ceil((_LONGEST + 1.0 - self.fraction) / step))
+        fractions = self.fraction + step * np.linspace(0.0, n, 2 * self._one.n_parts * n + 1)
+        targets = policy.target(self.nominal, fractions)
+        self._drives = self._one.drive @ np.moveaxis(targets_by_step(self._one, targets), 0, 1)
+
+
 class Surroundings:
     """The obstacles of one scene, as seen from the tool during a motion.
 
@@ -159,20 +233,25 @@ class Surroundings:
         self._gaps, self._packed = gaps, packed
         self._clearance, self._duration = clearance, duration
 
-    def state(self, z: Array, fraction: float, learned: Array) -> MotionState:
+    def state(self, z: Array, fraction: float, learned: Array, time: float | None = None) -> MotionState:
         """Return the state for position and velocity ``z`` = [x; T x'] (2, 3) at a fraction of the duration.
 
-        ``learned`` is the position of the nominal path at this time, shape (3,) [m].
+        Args:
+            z: position and velocity.
+            fraction: time divided by the duration.
+            learned: position of the nominal path at this time, shape (3,) [m].
+            time: time since the obstacles were where they are in the scene [s]; None: since the motion began.
         """
         x, v = z
+        time = fraction * self._duration if time is None else time
         if self._packed.still:
             gap, normal = self._gaps.gaps_and_normals(x)
             relative = v - self._packed.velocities  # 0
         else:
-            gap, normal = self._gaps.gaps_and_normals(x[None], [fraction * self._duration])
+            gap, normal = self._gaps.gaps_and_normals(x[None], [time])
             gap, normal = gap[:, 0], normal[:, 0]
             closest = x - (gap + self._gaps.radius)[:, None] * normal
-            relative = v - self._duration * self._velocities(closest, fraction * self._duration)
+            relative = v - self._duration * self._velocities(closest, time)
         return MotionState(
             x,
             v,
@@ -183,6 +262,7 @@ class Surroundings:
             np.maximum(gap + self._gaps.radius, GAP_FLOOR),
             normal,
             relative,
+            gap - self._clearance,
         )
 
     def _velocities(self, points: Array, time: float) -> Array:

@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 from imitarm.policies.baselines.baseline_policy import BaselinePolicy, ToolGaps
 from imitarm.policies.baselines.expert import PathProblem, displaced_paths
 from imitarm.policies.baselines.path_cost import FEATURES, PathCost
+from imitarm.policies.baselines.reaction import Reaction
+from imitarm.policies.baselines.receding_horizon import HorizonReaction, Weighted
+from imitarm.policies.least_cost import allowed_axes
 from imitarm.scene.scene import Scene
 from imitarm.skills.skill import Skill
 from imitarm.trajectory import Trajectory
@@ -39,6 +42,9 @@ class GmmIrl(BaselinePolicy):
     reinforcement learning from the optimal paths of an independent expert in other scenes
     (:mod:`imitarm.policies.baselines.irl_learning`). L-BFGS finds a local minimum from the learned path, and from paths
     that are displaced to each side; the policy follows the minimum of least cost.
+
+    Among obstacles that move, the cost is minimised again 30 times a second over the next 20 points
+    (:mod:`imitarm.policies.baselines.receding_horizon`).
 
     The distance to obstacles is a cost, not a constraint, so the path can be closer than the required clearance.
 
@@ -74,6 +80,12 @@ class GmmIrl(BaselinePolicy):
         self.weights[0] *= finite_number(closeness, "GmmIrl: closeness", above=0.0)
         self.weights[2:-1] *= finite_number(avoidance, "GmmIrl: avoidance", above=0.0)
         self.margin = finite_number(margin, "GmmIrl: margin", "m", at_least=0.0)
+
+    def reaction(self, nominal: Trajectory, position: Array, velocity: Array, fraction: float) -> Reaction:
+        """Return the motion along paths of least cost over a receding horizon."""
+        axes, one_sided = allowed_axes(self._forbidden)
+        cost = Weighted(self.skill, self.weights, self.margin, axes, one_sided, self.tool_spheres)
+        return HorizonReaction(cost, nominal, position, velocity, fraction)
 
     def tool_path(self, nominal: Trajectory, gaps: ToolGaps, scene: Scene) -> tuple[Array, Array]:
         """Return the path of least cost that was found."""

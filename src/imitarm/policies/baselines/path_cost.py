@@ -89,17 +89,17 @@ class PathCost:
         gap = self._gaps(deviation)[0]
         quadratic = np.einsum("ij,ijk,ik->", deviation, self.precisions, deviation) / N_FREE
         jerk = np.sum(deviation * (self.smoothness @ deviation))
-        near = [np.sum(_bump(gap, r)[0]) / N_FREE for r in RANGES]
-        deep = np.sum(_depth(-gap)[0]) + np.sum(_depth(deviation @ self.one_sided.T)[0])
+        near = [np.sum(bump(gap, r)[0]) / N_FREE for r in RANGES]
+        deep = np.sum(depth(-gap)[0]) + np.sum(depth(deviation @ self.one_sided.T)[0])
         return np.array([quadratic, jerk, *near, deep / N_FREE])
 
     def gradients(self, deviation: Array) -> Array:
         """Return the gradients of the features, shape (6, 94, k)."""
         gap, normal = self._gaps(deviation)
-        slopes = [_bump(gap, r)[1] for r in RANGES]
-        slopes.append(-_depth(-gap)[1])
+        slopes = [bump(gap, r)[1] for r in RANGES]
+        slopes.append(-depth(-gap)[1])
         rows = [np.einsum("oi,oik->ik", slope, normal) / N_FREE for slope in slopes]
-        rows[-1] = rows[-1] + _depth(deviation @ self.one_sided.T)[1] @ self.one_sided / N_FREE
+        rows[-1] = rows[-1] + depth(deviation @ self.one_sided.T)[1] @ self.one_sided / N_FREE
         quadratic = 2.0 * np.einsum("ijk,ik->ij", self.precisions, deviation) / N_FREE
         return np.stack([quadratic, 2.0 * self.smoothness @ deviation, *rows])
 
@@ -111,11 +111,11 @@ class PathCost:
         gap, normal = self._gaps(deviation)
         curvature = self._curvatures(deviation)
         outer = normal[..., :, None] * normal[..., None, :]
-        parts = [_bump(gap, r) for r in RANGES]
-        deep = _depth(-gap)
+        parts = [bump(gap, r) for r in RANGES]
+        deep = depth(-gap)
         parts.append((deep[0], -deep[1], deep[2]))
         rows = [np.einsum("oi,oijk->ijk", p[2], outer) + np.einsum("oi,oijk->ijk", p[1], curvature) for p in parts]
-        sided = _depth(deviation @ self.one_sided.T)[2]
+        sided = depth(deviation @ self.one_sided.T)[2]
         rows[-1] = rows[-1] + np.einsum("im,mj,mk->ijk", sided, self.one_sided, self.one_sided)
         return np.stack([2.0 * self.precisions, np.zeros_like(self.precisions), *rows]) / N_FREE
 
@@ -180,15 +180,15 @@ class PathCost:
         gap, normal = self._gaps(deviation)
         value, slope = np.zeros(()), np.zeros_like(gap)
         for w, r in zip(weights[2:-1], RANGES, strict=True):
-            bump = _bump(gap, r)
-            value, slope = value + w * bump[0].sum(), slope + w * bump[1]
-        deep, sided = _depth(-gap), _depth(deviation @ self.one_sided.T)
+            near = bump(gap, r)
+            value, slope = value + w * near[0].sum(), slope + w * near[1]
+        deep, sided = depth(-gap), depth(deviation @ self.one_sided.T)
         value, slope = value + weights[-1] * (deep[0].sum() + sided[0].sum()), slope - weights[-1] * deep[1]
         gradient = np.einsum("oi,oik->ik", slope, normal) + weights[-1] * sided[1] @ self.one_sided
         return float(value) / N_FREE, gradient / N_FREE
 
 
-def _bump(gap: Array, reach: float) -> tuple[Array, Array, Array]:
+def bump(gap: Array, reach: float) -> tuple[Array, Array, Array]:
     """Return ``exp(-max(g, 0)^2 / (2 l^2))`` and its first two derivatives with respect to g."""
     u = np.maximum(gap, 0.0) / reach
     value = np.exp(-0.5 * u * u)
@@ -196,7 +196,7 @@ def _bump(gap: Array, reach: float) -> tuple[Array, Array, Array]:
     return value, -u / reach * value, np.where(outside, (u * u - 1.0) / reach**2 * value, 0.0)
 
 
-def _depth(depth: Array) -> tuple[Array, Array, Array]:
+def depth(depth: Array) -> tuple[Array, Array, Array]:
     """Return ``max(m, 0)^2 / (2 (1 cm)^2)`` and its first two derivatives with respect to m."""
     m = np.maximum(depth, 0.0) / _DEPTH_SCALE
     return 0.5 * m * m, m / _DEPTH_SCALE, np.where(depth > 0.0, 1.0, 0.0) / _DEPTH_SCALE**2

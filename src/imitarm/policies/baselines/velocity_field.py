@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from imitarm.errors import InfeasibleError
 from imitarm.policies.baselines.baseline_policy import BaselinePolicy, ToolGaps
+from imitarm.policies.baselines.reaction import Reaction
 from imitarm.policies.least_cost import allowed_axes
 from imitarm.scene.distances import PackedObstacles
 from imitarm.scene.scene import Scene
@@ -44,6 +45,25 @@ class NearObstacles(NamedTuple):
     drift: Array
     outward: Array
     size: Array
+
+
+class _Follow(NamedTuple):
+    """The learned path at equal time steps, shape (n, 3) [m], and one step along it.
+
+    Attributes:
+        learned: the path.
+        ratio: length of the step, in samples of the path.
+        dt: length of the step [s].
+        fastest: limit of the desired speed [m/s].
+    """
+
+    learned: Array
+    ratio: float
+    dt: float
+    fastest: float
+
+
+_Around = tuple[ToolGaps, PackedObstacles, float]
 
 
 class VelocityField(BaselinePolicy):
@@ -95,30 +115,14 @@ class VelocityField(BaselinePolicy):
         times = np.linspace(0.0, nominal.duration, n)
         dt = float(times[1])
         learned, _ = nominal.at(nominal.times[0] + times)
-        fastest = _FASTEST * float(np.linalg.norm(np.diff(learned, axis=0), axis=1).max()) / dt
-        forbidden_part = np.eye(3) - self.axes @ self.axes.T
+        fastest = _fastest(learned, dt)
         x, phase = learned[0], 0.0
         path = [x]
         for step in range(int(_LONGEST * n)):
-            target = _at(phase, learned)
-            away = target - x
-            distance = float(np.linalg.norm(away))
-            if phase >= n - 1 and distance < _ARRIVED:
+            if phase >= n - 1 and float(np.linalg.norm(_at(phase, learned) - x)) < _ARRIVED:
                 break
-            rate = 1.0 / (1.0 + distance / self.slack)
-            ahead = min(phase + rate, n - 1.0)
-            forward = (_at(ahead, learned) - target) / dt
-            desired = forward + self.pull * away
-            desired *= min(1.0, fastest / max(float(np.linalg.norm(desired)), 1e-12))
-            fixed = forbidden_part @ desired
-            around = self._obstacles(x, step * dt, fixed, gaps, scene.packed)
-            limits = self.one_sided @ (self.axes.T @ (forward + away / dt))
-            v = self.velocity(desired @ self.axes, around, limits)
-            for f, limit in zip(self.one_sided, limits, strict=True):
-                v = v - max(float(f @ v) - limit, 0.0) * f
-            x = x + dt * (fixed + self.axes @ v)
+            x, phase = self.moved(x, phase, _Follow(learned, 1.0, dt, fastest), (gaps, scene.packed, step * dt))
             path.append(x)
-            phase = ahead
         away_from_goal = float(np.linalg.norm(learned[-1] - x))
         if away_from_goal > _NEAR:
             raise InfeasibleError(
@@ -126,6 +130,36 @@ class VelocityField(BaselinePolicy):
                 f"learned duration; choose other options, or another policy"
             )
         return np.linspace(0.0, dt * (len(path) - 1), len(path)), np.stack(path)
+
+    def moved(self, x: Array, phase: float, follow: _Follow, around: _Around) -> tuple[Array, float]:
+        """Return the position of the tool and the phase after one step.
+
+        Args:
+            x: position before, shape (3,) [m].
+            phase: index of the point on the learned path.
+            follow: the learned path, and the step.
+            around: gaps, obstacles, and the time since they were where they are in the scene.
+        """
+        learned, ratio, dt, fastest = follow
+        target = _at(phase, learned)
+        away = target - x
+        rate = 1.0 / (1.0 + float(np.linalg.norm(away)) / self.slack)
+        ahead = min(phase + ratio * rate, len(learned) - 1.0)
+        forward = (_at(ahead, learned) - target) / dt
+        desired = forward + self.pull * away
+        desired *= min(1.0, fastest / max(float(np.linalg.norm(desired)), 1e-12))
+        fixed = (np.eye(3) - self.axes @ self.axes.T) @ desired
+        gaps, packed, time = around
+        near = self._obstacles(x, time, fixed, gaps, packed)
+        limits = self.one_sided @ (self.axes.T @ (forward + away / dt))
+        v = self.velocity(desired @ self.axes, near, limits)
+        for f, limit in zip(self.one_sided, limits, strict=True):
+            v = v - max(float(f @ v) - limit, 0.0) * f
+        return x + dt * (fixed + self.axes @ v), ahead
+
+    def reaction(self, nominal: Trajectory, position: Array, velocity: Array, fraction: float) -> Reaction:
+        """Return the motion in the velocity field, one control period at a time."""
+        return _FieldReaction(self, nominal, position, velocity, fraction)
 
     def _obstacles(self, x: Array, time: float, fixed: Array, gaps: ToolGaps, packed: PackedObstacles) -> NearObstacles:
         """Return the obstacles at a time, seen from the tip at ``x``, which moves with ``fixed`` in any case."""
@@ -145,6 +179,31 @@ class VelocityField(BaselinePolicy):
             np.where(bounded[:, None], outward, normal) @ self.axes,
             np.where(bounded, packed.radii, _LARGEST_SIZE) + gaps.radius + self.clearance,
         )
+
+
+class _FieldReaction(Reaction):
+    """The velocity field of a policy, one control period at a time."""
+
+    def __init__(
+        self, policy: VelocityField, nominal: Trajectory, position: Array, velocity: Array, fraction: float
+    ) -> None:
+        super().__init__(nominal, position, velocity, fraction)
+        self._policy, self._last = policy, len(nominal) - 1.0
+        self._dt = nominal.duration / self._last
+        self._learned, _ = nominal.at(nominal.times[0] + np.linspace(0.0, nominal.duration, len(nominal)))
+        self._fastest = _fastest(self._learned, self._dt)
+
+    def step(self, scene: Scene, dt: float) -> None:
+        """Move with the field of the observed obstacles; the point on the path waits for the tool."""
+        follow = _Follow(self._learned, dt / self._dt, dt, self._fastest)
+        around = ToolGaps(scene, self._policy.tool_spheres), scene.packed, 0.0
+        self.position, phase = self._policy.moved(self.position, self.fraction * self._last, follow, around)
+        self.fraction = phase / self._last
+
+
+def _fastest(learned: Array, dt: float) -> float:
+    """Return the limit of the desired speed [m/s] for positions (n, 3) at intervals ``dt``."""
+    return _FASTEST * float(np.linalg.norm(np.diff(learned, axis=0), axis=1).max()) / dt
 
 
 def _at(index: float, rows: Array) -> Array:
