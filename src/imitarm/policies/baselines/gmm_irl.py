@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cholesky, solve_triangular
+from scipy.optimize import minimize
 
 from imitarm.policies.baselines.baseline_policy import BaselinePolicy, ToolGaps
 from imitarm.policies.baselines.expert import PathProblem, displaced_paths
-from imitarm.policies.baselines.path_cost import FEATURES, PathCost
+from imitarm.policies.baselines.path_cost import FEATURES, N_FREE, N_SAMPLES, PRECISION, RANGES, PathCost, bump, depth
 from imitarm.policies.baselines.reaction import Reaction
-from imitarm.policies.baselines.receding_horizon import HorizonReaction, Weighted
+from imitarm.policies.component_path import quintic_step
 from imitarm.policies.least_cost import allowed_axes
 from imitarm.scene.scene import Scene
 from imitarm.skills.skill import Skill
@@ -24,6 +27,16 @@ from imitarm.validation import finite_array, finite_number
 
 Array = NDArray[np.float64]
 
+HORIZON = 20
+"""Points of the horizon."""
+_SPACING = 2  # of the horizon's points, in samples of the whole path, which has 100
+_N_FREE = N_FREE / _SPACING  # points to which the mean features refer
+PERIOD = 1.0 / 30.0
+"""Time between two plans [s]."""
+_ITERATIONS = 30
+_ASIDE = 0.08  # [m] height of the first displacements
+_NEAR = 0.10  # [m] gap below which displacements to the sides are tried
+_STARTS = 3  # of the optimiser, those of least cost
 WEIGHTS = Path(__file__).with_name("gmm_irl_weights.json")
 
 
@@ -44,7 +57,7 @@ class GmmIrl(BaselinePolicy):
     that are displaced to each side; the policy follows the minimum of least cost.
 
     Among obstacles that move, the cost is minimised again 30 times a second over the next 20 points
-    (:mod:`imitarm.policies.baselines.receding_horizon`).
+    (:class:`HorizonReaction`).
 
     The distance to obstacles is a cost, not a constraint, so the path can be closer than the required clearance.
 
@@ -102,3 +115,160 @@ def path_cost(problem: PathProblem, skill: Skill, margin: float = 0.0) -> PathCo
     """Return the features of paths in a scene, with the covariances of a skill; ``margin`` reduces each gap [m]."""
     covariances = skill.gmr_.predict(problem.times / problem.times[-1] * skill.duration_)[1]
     return PathCost(problem.nominal, covariances, problem.times, problem.gaps, margin, problem.axes, problem.one_sided)
+
+
+class Weighted(NamedTuple):
+    """The cost of :mod:`~imitarm.policies.baselines.path_cost` with its weights and directions.
+
+    Attributes:
+        skill: the skill, for the covariances of the demonstrations.
+        weights: weight of each feature.
+        margin: distance that is subtracted from each gap [m].
+        axes: orthonormal basis of the allowed directions, as columns, shape (3, k).
+        one_sided: directions in which the path must not be displaced, in this basis, shape (m, k).
+        tool_spheres: spheres that contain the tool, or None.
+    """
+
+    skill: Skill
+    weights: Array
+    margin: float
+    axes: Array
+    one_sided: Array
+    tool_spheres: Array | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Horizon:
+    """The cost of the next 20 deviations d_1 ... d_20, after the known d_-2, d_-1, d_0; shapes (20, k), (3, k).
+
+    The features are those of the whole path, over the points of the horizon. The jerk couples the first points with the
+    known ones, so that the plan continues the motion smoothly. As for the whole path, the three deviations after the
+    last one are 0: the weight of the deviation alone would not bring the tool back.
+    """
+
+    cost: Weighted
+    points: Array  # learned positions, (20, 3) [m]
+    times: Array  # of the points, from now (20,) [s]
+    gaps: ToolGaps
+    factor: Array  # upper Cholesky factor of the Hessian of the quadratic features
+    lowest: Array  # deviation of least quadratic cost, (20, k)
+
+    @classmethod
+    def of(
+        cls, cost: Weighted, points: Array, fractions: Array, times: Array, gaps: ToolGaps, known: Array
+    ) -> _Horizon:
+        k = cost.axes.shape[1]
+        covariances = cost.skill.gmr_.predict(np.minimum(fractions, 1.0) * cost.skill.duration_)[1]
+        inverse = np.linalg.inv(covariances + PRECISION**2 * np.eye(3))
+        precisions = cost.axes.T @ inverse @ cost.axes
+        third = np.diff(np.eye(HORIZON + 6), 3, axis=0)[:, :-3]  # of the known and the free deviations
+        jerk = 2.0 * cost.weights[1] * (float(N_SAMPLES - 1) / _SPACING) ** 5
+        hessian = np.kron(jerk * third[:, 3:].T @ third[:, 3:], np.eye(k))
+        for i, block in enumerate(precisions):
+            hessian[i * k : (i + 1) * k, i * k : (i + 1) * k] += 2.0 * cost.weights[0] / _N_FREE * block
+        linear = jerk * third[:, 3:].T @ (third[:, :3] @ known)
+        factor = cholesky(hessian)
+        lowest = -solve_triangular(factor, solve_triangular(factor, linear.ravel(), trans=1))
+        return cls(cost, points, times, gaps, factor, lowest.reshape(HORIZON, k))
+
+    def value(self, deviation: Array) -> tuple[float, Array]:
+        """Return the cost, up to a constant, and its gradient (20, k)."""
+        y = self.factor @ (deviation - self.lowest).ravel()
+        value, slope = self._avoidance(deviation)
+        return 0.5 * float(y @ y) + value, (self.factor.T @ y).reshape(deviation.shape) + slope
+
+    def minimised(self, start: Array) -> tuple[float, Array]:
+        """Return the least cost that L-BFGS reaches from a deviation, and its deviation (20, k)."""
+
+        def cost(y: Array) -> tuple[float, Array]:
+            deviation = self.lowest + solve_triangular(self.factor, y).reshape(start.shape)
+            value, slope = self._avoidance(deviation)
+            return 0.5 * float(y @ y) + value, y + solve_triangular(self.factor, slope.ravel(), trans=1)
+
+        options = {"maxiter": _ITERATIONS, "maxcor": 10}
+        found = minimize(
+            cost, self.factor @ (start - self.lowest).ravel(), jac=True, method="L-BFGS-B", options=options
+        )
+        return float(found.fun), self.lowest + solve_triangular(self.factor, found.x).reshape(start.shape)
+
+    def _avoidance(self, deviation: Array) -> tuple[float, Array]:
+        """Return the features about obstacles, weighted, and their gradient."""
+        weights, axes, one_sided = self.cost.weights, self.cost.axes, self.cost.one_sided
+        points = self.points + deviation @ axes.T
+        gap, normal = self.gaps.gaps_and_normals(points[:, None], self.times)
+        gap, normal = gap[:, :, 0] - self.cost.margin, normal[:, :, 0] @ axes
+        value, slope = 0.0, np.zeros_like(gap)
+        for w, r in zip(weights[2:-1], RANGES, strict=True):
+            found = bump(gap, r)
+            value, slope = value + w * float(found[0].sum()), slope + w * found[1]
+        deep, sided = depth(-gap), depth(deviation @ one_sided.T)
+        value += weights[-1] * float(deep[0].sum() + sided[0].sum())
+        gradient = np.einsum("oi,oik->ik", slope - weights[-1] * deep[1], normal)
+        return value / _N_FREE, (gradient + weights[-1] * sided[1] @ one_sided) / _N_FREE
+
+
+class HorizonReaction(Reaction):
+    """Follow the path of least cost over the next 20 points, 0.4 of the duration, planned 30 times a second.
+
+    The obstacles are predicted with their velocities. L-BFGS starts from the last plan, from the learned path, and from
+    displacements to the sides.
+    """
+
+    def __init__(self, cost: Weighted, nominal: Trajectory, position: Array, velocity: Array, fraction: float) -> None:
+        super().__init__(nominal, position, velocity, fraction)
+        self._cost, self._spacing = cost, float(_SPACING * nominal.duration / (N_SAMPLES - 1))
+        self._plan, self._age = np.zeros((HORIZON + 1, cost.axes.shape[1])), np.inf
+        if fraction > 0.0:
+            step = self._spacing / nominal.duration
+            learned = (self.learned(fraction + 0.5 * step) - self.learned(fraction - 0.5 * step)) / self._spacing
+            self._plan[1] = self._spacing * (velocity - learned) @ cost.axes
+
+    def step(self, scene: Scene, dt: float) -> None:
+        """Plan if the plan is old, and follow the plan."""
+        if self._age >= PERIOD - 1e-9:
+            self._plan, self._age = self._planned(scene), 0.0
+        self._age += dt
+        self.fraction += dt / self.nominal.duration
+        self.position = self.learned(self.fraction) + self._deviation(self._age) @ self._cost.axes.T
+
+    def _deviation(self, age: float) -> Array:
+        """Return the planned deviation at a time after the plan was made, shape (k,)."""
+        i = min(age / self._spacing, HORIZON - 1e-6)
+        low = int(i)
+        return np.asarray(self._plan[low] + (i - low) * (self._plan[low + 1] - self._plan[low]))
+
+    def _planned(self, scene: Scene) -> Array:
+        """Return the deviations now and at the 20 points of the horizon, shape (21, k)."""
+        axes, T = self._cost.axes, self.nominal.duration
+        times: Array = self._spacing * np.arange(1.0, HORIZON + 1.0)
+        points = self._learned_at(self.fraction + times / T)
+        deviation = (self.position - self.learned(self.fraction)) @ axes
+        rate = (self._plan[1] - self._plan[0]) / self._spacing
+        known = deviation - self._spacing * np.array([2.0, 1.0, 0.0])[:, None] * rate
+        gaps = ToolGaps(scene, self._cost.tool_spheres)
+        horizon = _Horizon.of(self._cost, points, self.fraction + times / T, times, gaps, known)
+        starts = [np.zeros((HORIZON, len(deviation))), horizon.lowest]
+        if np.isfinite(self._age):
+            starts.append(np.array([self._deviation(self._age + t) for t in times]))
+        starts += self._aside(points, times, gaps)
+        if not gaps.n_obstacles:
+            return np.concatenate([deviation[None], horizon.lowest])
+        starts = sorted(starts, key=lambda start: horizon.value(start)[0])[:_STARTS]
+        best = min((horizon.minimised(start) for start in starts), key=lambda found: found[0])
+        return np.concatenate([deviation[None], best[1]])
+
+    def _aside(self, points: Array, times: Array, gaps: ToolGaps) -> list[Array]:
+        """Return displacements to all sides where the learned path comes near an obstacle."""
+        gap = gaps.gaps(points[:, None], times)[:, :, 0].min(axis=0, initial=np.inf)
+        if gap.min() > _NEAR:
+            return []
+        at = int(np.argmin(gap))
+        ahead = (points[min(at + 1, HORIZON - 1)] - points[max(at - 1, 0)]) @ self._cost.axes
+        _, _, basis = np.linalg.svd(ahead[None])
+        weight = quintic_step(1.0 - np.abs(np.arange(HORIZON) - at) / (0.5 * HORIZON))
+        return [sign * _ASIDE * weight[:, None] * side for side in basis[1:] for sign in (1.0, -1.0)]
+
+    def _learned_at(self, fractions: Array) -> Array:
+        phases = np.clip(fractions, 0.0, 1.0)
+        found: Array = self.nominal.at(self.nominal.times[0] + phases * self.nominal.duration)[0]
+        return found
