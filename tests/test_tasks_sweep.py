@@ -16,7 +16,7 @@ from imitarm.policies.adaptation import HORIZONTAL_ONLY
 from imitarm.safety import SafetyFilter
 from imitarm.scene import Scene, load_scene, save_scene
 from imitarm.skills import Skill
-from imitarm.tasks.sweep import DEMONSTRATIONS, NUMBERED_SCENES, SCENES, SWEEPING, SweepTask
+from imitarm.tasks.sweep import DEMONSTRATIONS, MOVING_SCENES, NUMBERED_SCENES, SCENES, SWEEPING, SweepTask
 from imitarm.trajectory import Trajectory
 
 ARM = SweepTask.arm()
@@ -182,3 +182,22 @@ def test_dirt_time_is_when_the_path_meets_the_dirt():
 def test_a_task_without_dirt_is_refused(options):
     with pytest.raises(InputError, match="n_crumbs must be at least 1"):
         SweepTask(**options)
+
+
+@pytest.mark.parametrize("name", MOVING_SCENES)
+def test_moving_scenes_begin_and_end_clear_of_the_brush_and_cross_its_path(name):
+    moving = SweepTask.moving_scene(name)
+    path = SweepTask.motion().curve(np.linspace(0.0, 1.0, 200))
+    first, last = moving.at(0.0), moving.at(60.0)
+    assert first.clearance(path[0]) > 0.1 and last.clearance(path[-1]) > 0.1
+    crossed = [moving.at(t).clearance(path).min() for t in np.linspace(0.0, 11.0, 56)]
+    assert min(crossed) < SweepTask.tool_radius
+    assert [fixture.name for fixture in first.fixtures][0] == "table"
+    robot = SweepTask().robot(moving)
+    assert robot._moving
+    np.testing.assert_allclose(robot.scene.packed.positions, first.packed.positions, atol=1e-9)
+
+
+def test_an_unknown_moving_scene_is_refused():
+    with pytest.raises(UnknownNameError, match="pushed_box"):
+        SweepTask.moving_scene("pushed_boxes")

@@ -117,6 +117,7 @@ def run_scene(
         joint_names=tuple(robot.arm.joint_names),
         caption=caption,
         details=_details(rollout, policy),
+        nominal=policy.skill.gmr_.trajectory(200),
     )
 
 

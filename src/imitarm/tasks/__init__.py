@@ -5,7 +5,7 @@ from __future__ import annotations
 from imitarm.tasks.open_box import OpenBoxTask
 from imitarm.tasks.packing import PackingTask
 from imitarm.tasks.stack import StackTask
-from imitarm.tasks.sweep import DEMONSTRATIONS, NUMBERED_SCENES, SCENES, SweepTask
+from imitarm.tasks.sweep import DEMONSTRATIONS, MOVING_SCENES, NUMBERED_SCENES, SCENES, SweepTask
 
 TASKS: dict[str, type[SweepTask] | type[StackTask] | type[OpenBoxTask] | type[PackingTask]] = {
     "open_box": OpenBoxTask,
@@ -16,6 +16,7 @@ TASKS: dict[str, type[SweepTask] | type[StackTask] | type[OpenBoxTask] | type[Pa
 
 __all__ = [
     "DEMONSTRATIONS",
+    "MOVING_SCENES",
     "NUMBERED_SCENES",
     "SCENES",
     "TASKS",

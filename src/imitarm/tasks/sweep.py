@@ -17,7 +17,7 @@ from imitarm.kinematics.arm_kinematics import find_posture
 from imitarm.kinematics.pose import Pose
 from imitarm.robots.simulated import Control, SimulatedRobot
 from imitarm.robots.world import arm_world
-from imitarm.scene import HalfSpace, Scene, load_scene, standard_fixtures
+from imitarm.scene import HalfSpace, MovingScene, Scene, load_moving_scene, load_scene, standard_fixtures
 from imitarm.tasks.habits import Motion, along
 from imitarm.trajectory import Rollout, Trajectory
 
@@ -30,6 +30,7 @@ SCENES = (
     *("boxes_and_cone", "cone_first", "three_boxes"),
     *("two_boxes_two_cones", "three_boxes_and_cone"),
 )
+MOVING_SCENES = ("pushed_box", "pushed_box_and_bottle")  # obstacles that move while the arm sweeps
 NUMBERED_SCENES = {f"T{i}": name for i, name in enumerate(SCENES) if i}  # eight tasks, as in thesis Table 4.1
 
 TABLE_CENTER, TABLE_SIZE = (0.66, 0.0), (0.72, 1.36, 0.04)  # [m] its top is at height 0
@@ -106,6 +107,19 @@ class SweepTask:
         table = HalfSpace(np.zeros(3), name="table")
         return replace(scene, fixtures=(table, *standard_fixtures()))
 
+    @staticmethod
+    def moving_scene(name: str) -> MovingScene:
+        """Return the packaged scene ``name``, one of :data:`MOVING_SCENES`, whose obstacles follow tracks.
+
+        Raises:
+            UnknownNameError: when there is no such scene.
+        """
+        if name not in MOVING_SCENES:
+            raise UnknownNameError.among("moving scene", name, MOVING_SCENES)
+        moving = load_moving_scene(DEMONSTRATIONS / "scenes" / f"{name}.yaml")
+        table = HalfSpace(np.zeros(3), name="table")
+        return replace(moving, scene=replace(moving.scene, fixtures=(table, *standard_fixtures())))
+
     @classmethod
     def scenes(cls) -> Mapping[str, Scene]:
         """Return all packaged scenes by name, the scene without obstacles first."""
@@ -165,17 +179,20 @@ class SweepTask:
         return spec
 
     def robot(
-        self, scene: Scene | None = None, *, arm: ArmModel | None = None, control: Control = "position"
+        self, scene: Scene | MovingScene | None = None, *, arm: ArmModel | None = None, control: Control = "position"
     ) -> SimulatedRobot:
         """Return the simulated robot in ``scene``, with its brush at S.
 
         Args:
-            scene: obstacles on the table; None for no obstacles.
+            scene: obstacles on the table, which may follow tracks; None for no obstacles.
             arm: the arm, if it has been loaded already.
             control: control mode of the drives.
         """
         arm = self.arm() if arm is None else arm
-        return SimulatedRobot(arm, scene=scene, world=self.world(arm), control=control, q=self.start_posture(arm))
+        start, world, motion = self.start_posture(arm), self.world(arm), None
+        if isinstance(scene, MovingScene):
+            scene, motion = scene.scene, scene.motions
+        return SimulatedRobot(arm, scene=scene, motion=motion, world=world, control=control, q=start)
 
     def start_posture(self, arm: ArmModel) -> Array:
         """Return joint angles (n_joints,) [rad] with the brush at S."""

@@ -91,6 +91,7 @@ class SceneResult:
         required_clearance: distance that the robot must keep from every obstacle [m].
         rollout: the measured motion; None when the robot did not start.
         adaptation: the planned path; None when the path was not adapted.
+        nominal: the learned path, drawn when there is no ``adaptation``; None: not drawn.
         rmse: root mean square distance from the measured path to the demonstrations [m]; NaN when unknown.
         reason: explanation of why the run ended.
         tool_radius: radius of the sphere that contained the tool in the plan [m].
@@ -122,6 +123,7 @@ class SceneResult:
     joint_names: tuple[str, ...] = ()
     caption: str = ""
     details: Mapping[str, Any] = field(default_factory=dict)
+    nominal: Trajectory | None = None
 
     def __post_init__(self) -> None:
         if not self.name.strip():

@@ -187,6 +187,8 @@ def _playback(scene: SceneResult) -> str:
         for k, moved in enumerate(a.moved):
             name, mean = f"component {k + 1}", a.means[k] + a.displacement[k]
             components.append(ComponentMark(name, mean, a.covariances[k], palette.MOVED if moved else palette.UNMOVED))
+    elif scene.nominal is not None:
+        paths.append(PathMark("learned path", scene.nominal.positions, palette.NOMINAL, 0.004))
     if scene.rollout is not None:
         lift = np.array([0.0, 0.0, 0.004])  # [m] where two paths coincide, the picture would flicker
         paths.append(PathMark("measured path", scene.rollout.trajectory.positions + lift, palette.MEASURED, 0.003))

@@ -190,7 +190,7 @@ def _draw_predictions(server: Any, predictions: Sequence[Prediction]) -> list[Mo
             node_name("predictions", number, prediction.name),
             1.0,
             palette.rgb(palette.PREDICTED),
-            opacity=0.3,
+            opacity=0.45,
             scale=tuple(scale[0].tolist()),
             position=positions[0],
             visible=bool(seen[0]),
