@@ -192,7 +192,7 @@ def test_moving_scenes_begin_and_end_clear_of_the_brush_and_cross_its_path(name)
     assert first.clearance(path[0]) > 0.1 and last.clearance(path[-1]) > 0.1
     crossed = [moving.at(t).clearance(path).min() for t in np.linspace(0.0, 11.0, 56)]
     assert min(crossed) < SweepTask.tool_radius
-    assert [fixture.name for fixture in first.fixtures][0] == "table"
+    assert first.fixtures[0].name == "table"
     robot = SweepTask().robot(moving)
     assert robot._moving
     np.testing.assert_allclose(robot.scene.packed.positions, first.packed.positions, atol=1e-9)
