@@ -104,6 +104,39 @@ def bootstrap(samples: ArrayLike, *, confidence: float = 0.95, seed: int = 0) ->
     return float(low), float(high)
 
 
+def block_bootstrap(
+    values: ArrayLike, times: ArrayLike, block: float, *, confidence: float = 0.95, seed: int = 0
+) -> tuple[float, float]:
+    """Return the bootstrap interval of the mean of a time series whose neighbouring values are correlated.
+
+    The series is cut into blocks of equal duration, and whole blocks are resampled, so that the correlation inside a
+    block is kept. The blocks should be several times as long as the correlation lasts.
+
+    Args:
+        values: shape (n,).
+        times: time of each value, shape (n,) [s].
+        block: duration of a block [s].
+        confidence: confidence level of the interval.
+        seed: seed of the resampling.
+
+    Returns:
+        low and high; nan with fewer than two blocks.
+    """
+    x, t = np.asarray(values, dtype=float), np.asarray(times, dtype=float)
+    if not len(x):
+        return math.nan, math.nan
+    _, member = np.unique(np.floor((t - t.min()) / block), return_inverse=True)
+    counts, sums = np.bincount(member), np.bincount(member, weights=x)
+    n = len(counts)
+    if n < 2:
+        return math.nan, math.nan
+    drawn = np.random.default_rng(seed).integers(0, n, (_DRAWS, n))
+    means = sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
+    widened = x.mean() + (means - x.mean()) * math.sqrt(n / (n - 1))
+    low, high = np.quantile(widened, [0.5 - 0.5 * confidence, 0.5 + 0.5 * confidence])
+    return float(low), float(high)
+
+
 def median_ratio(
     ours: ArrayLike, theirs: ArrayLike, *, confidence: float = 0.95, seed: int = 0
 ) -> tuple[float, float, float]:

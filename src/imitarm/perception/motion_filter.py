@@ -22,7 +22,12 @@ MOTIONS: dict[str, tuple[int, ...]] = {  # order of the highest derivative in th
     "constant-acceleration": (2,),
     "imm": (1, 2),
 }
-DEFAULT_NOISE = (math.nan, 0.05, 10.0)  # by order; [m^2/s^3] and [m^2/s^5]
+DEFAULT_NOISE: dict[str, tuple[float, ...]] = {  # of each model; [m^2/s^3] for order 1, [m^2/s^5] for order 2
+    "constant-velocity": (0.05,),
+    "ekf": (0.05,),
+    "constant-acceleration": (1.0,),
+    "imm": (0.02, 1.0),
+}
 DWELL_TIME = 0.5  # [s] mean time for which an obstacle keeps one model of an IMM
 INITIAL_ACCELERATION = 2.0  # [m/s^2] standard deviation of each component of a new obstacle's acceleration
 
@@ -172,7 +177,7 @@ class MotionFilter:
     def __init__(self, motion: str, noise: float | Sequence[float] | None, initial_speed: float) -> None:
         """Check the arguments; see :class:`~imitarm.perception.ObstacleTracker`."""
         self.orders = MOTIONS[choice(motion, MOTIONS, "motion")]
-        self.noise = _checked_noise(noise, self.orders)
+        self.noise = DEFAULT_NOISE[motion] if noise is None else _checked_noise(noise, self.orders)
         self.initial_speed = finite_number(initial_speed, "ObstacleTracker: initial_speed", "m/s", above=0.0)
         self.size = m = 3 * (max(self.orders) + 1)
         models = len(self.orders)
@@ -274,9 +279,7 @@ def _mirrored(Q: Array) -> Array:
     return Q * sign[:, None] * sign
 
 
-def _checked_noise(noise: float | Sequence[float] | None, orders: tuple[int, ...]) -> tuple[float, ...]:
-    if noise is None:
-        return tuple(DEFAULT_NOISE[order] for order in orders)
+def _checked_noise(noise: float | Sequence[float], orders: tuple[int, ...]) -> tuple[float, ...]:
     given = list(noise) if isinstance(noise, Sequence) else [noise]
     if len(given) != len(orders):
         raise InputError(

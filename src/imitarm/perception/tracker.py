@@ -76,7 +76,7 @@ class ObstacleTracker:
             their likelihoods) or ``"ekf"``. The last one uses constant velocity and measures in the coordinates of the
             camera (:attr:`Detection.camera_to_base`).
         process_noise: spectral density of the noise that changes the velocity [m^2/s^3] or, with constant acceleration,
-            the acceleration [m^2/s^5]; two numbers for ``"imm"``. None: 0.05 and 10.
+            the acceleration [m^2/s^5]; two numbers for ``"imm"``. None: 0.05; 1; (0.02, 1).
         gate: probability that a correct detection is within the gate.
         confirm: (hits, updates) that confirm a track.
         max_unseen: time after the last detection at which a track ends [s].
@@ -132,6 +132,11 @@ class ObstacleTracker:
     def tracks(self) -> tuple[TrackedObstacle, ...]:
         """The confirmed tracks at :attr:`stamp`, in the order of their numbers."""
         return self._steps[-1].tracks.view if self._steps else ()
+
+    @property
+    def innovations(self) -> Array:
+        """Normalised innovation squared of each detection that was assigned in the newest update, shape (k,)."""
+        return self._steps[-1].distances if self._steps else np.empty(0)
 
     @property
     def consistency(self) -> Consistency:
