@@ -1,4 +1,4 @@
-"""Draw what thesis Figs 4.2 to 4.8 and 5.4 show, with this library, for docs/chapter_4.md and docs/simulation.md.
+"""Draw what thesis Figs 4.2 to 4.8, 5.4 and 5.9 show, with this library, for the pages in docs/.
 
     MUJOCO_GL=egl python scripts/draw_thesis_figures.py docs/images
 
@@ -21,18 +21,23 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from imitarm.benchmark.tracked_motions import PERIOD, RecordedMotion
+from imitarm.benchmark.tracking import follow
+from imitarm.benchmark.tracking_report import draw_positions
 from imitarm.control_loop import reproduce
+from imitarm.control_loop.observer import SensorModel
 from imitarm.control_loop.reproduce import Step
 from imitarm.demonstrations import align, read
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import Pose, quaternion_exp
+from imitarm.perception import ObstacleTracker
 from imitarm.policies import ACFRA, HORIZONTAL_ONLY, adapt
 from imitarm.policies.adapted_path import Adaptation
 from imitarm.policies.baselines.potential_components import INFLUENCE_DISTANCE, component_distances
 from imitarm.policies.component_path import ComponentPath
 from imitarm.robots import SimulatedRobot
 from imitarm.safety import SafetyFilter
-from imitarm.scene import Box, HalfSpace, Scene
+from imitarm.scene import Box, HalfSpace, MovingScene, Scene, Sphere, Track
 from imitarm.skills import Skill
 from imitarm.tasks import DEMONSTRATIONS, OpenBoxTask, SweepTask
 from imitarm.tasks.habits import demonstrations_by, s_shaped_reach
@@ -341,6 +346,21 @@ def figure_5_4() -> Figure:
     return figure
 
 
+def figure_5_9() -> Figure:
+    """Detections of a swaying obstacle, the estimate of the tracker, and the true position."""
+    times = np.arange(0.0, 12.0, PERIOD)
+    angle = 2.0 * np.pi * 0.15 * times
+    positions = np.stack([0.25 * np.sin(angle), 0.05 * np.cos(angle), np.zeros(len(times))], axis=1)
+    scene = MovingScene(Scene(None, (Sphere(positions[0], 0.05),)), {0: Track(times, positions)})
+    velocities = np.gradient(positions, PERIOD, axis=0)
+    motion = RecordedMotion("swaying", ("sphere",), times, positions[None], velocities[None], scene)
+    log = follow(motion, ObstacleTracker(), SensorModel(noise=0.015, dropout=0.2)).logs[0]
+    figure = Figure(figsize=(6.0, 4.0), layout="constrained")
+    draw_positions(*figure.subplots(2, 1, sharex=True), log)
+    figure.legend(loc="outside lower center", ncols=3)
+    return figure
+
+
 FIGURES = {
     "4.2": figure_4_2,
     "4.3": figure_4_3,
@@ -350,6 +370,7 @@ FIGURES = {
     "4.7": lambda: pictured("T1"),
     "4.8": lambda: pictured("T4"),
     "5.4": figure_5_4,
+    "5.9": figure_5_9,
 }
 
 if __name__ == "__main__":

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,6 @@ from imitarm.control_loop.observer import SensorModel
 from imitarm.evaluation.intervals import block_bootstrap, wilson_interval
 from imitarm.perception import CoverageMargin, ObstacleTracker
 from imitarm.scene import MovingScene, Scene, Sphere
-from imitarm.scene.motion import Motion
 
 Array = NDArray[np.float64]
 
@@ -42,7 +42,7 @@ class Windows(NamedTuple):
     starts: Array
 
 
-def random_motion(rng: np.random.Generator) -> Motion:
+def random_motion(rng: np.random.Generator) -> Callable[[float], Array]:
     """Return a random motion from the origin: steady, swaying, or stopping and going, at 0.1 to 0.6 m/s."""
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
@@ -83,6 +83,10 @@ def synthetic_windows(n: int, stream: int, sensor: SensorModel = SENSOR, seed: i
     return np.array(found[:n])
 
 
+def _moved(place: Array, motion: Callable[[float], Array], time: float) -> Array:
+    return place + motion(time)
+
+
 def _batch(rng: np.random.Generator, sensor: SensorModel) -> list[Array]:
     """Return the windows of obstacles that one tracker follows."""
     columns, rows = 6, _TOGETHER // 6
@@ -90,7 +94,7 @@ def _batch(rng: np.random.Generator, sensor: SensorModel) -> list[Array]:
     motions = [random_motion(rng) for _ in places]
     truth = MovingScene(
         Scene(None, tuple(Sphere(place, 0.05) for place in places)),
-        {i: (lambda time, p=place, m=motions[i]: p + m(time)) for i, place in enumerate(places)},
+        {i: partial(_moved, place, motion) for i, (place, motion) in enumerate(zip(places, motions, strict=True))},
     )
     sensor = SensorModel(
         sensor.noise, sensor.rate, sensor.latency, sensor.dropout, reach=100.0, seed=int(rng.integers(2**31))

@@ -21,6 +21,7 @@ from imitarm.benchmark.recordings import KINDS
 from imitarm.benchmark.refusal_oracle import Answer
 from imitarm.cli.benchmark_options import add_fill, add_workers, place_of, report_tables, workers_of
 from imitarm.cli.benchmark_static import add_static
+from imitarm.cli.benchmark_tracking import add_tracking
 from imitarm.cli.outputs import check_outputs, same_place
 from imitarm.cli.robot_options import add_robot_options
 from imitarm.cli.run_scene import provenance
@@ -44,6 +45,7 @@ examples:
   imitarm benchmark refusals --scenes 1000
   imitarm benchmark static --count 100 --out static
   imitarm benchmark static compare static --report static.html
+  imitarm benchmark tracking --data recordings --report tracking.html
 
 'mapping' saves each result in the folder --out, and 'placements' in the file --out.
 If one of them was interrupted, the same command continues where it stopped.
@@ -115,6 +117,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     third.set_defaults(benchmark=_refusals)
     _add_placements(parsers)
     add_static(parsers)
+    add_tracking(parsers)
     people = parsers.add_parser("people", help="retarget recordings of real people to simulated arms")
     people.add_argument(
         "data",

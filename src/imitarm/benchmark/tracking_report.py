@@ -1,0 +1,116 @@
+"""The results of the tracking benchmark as one HTML page, with the form of thesis Fig 5.9."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from imitarm.benchmark.tables import Table
+from imitarm.benchmark.tracked_motions import RecordedMotion
+from imitarm.benchmark.tracking import TrackLog, follow
+from imitarm.perception import ObstacleTracker
+from imitarm.viewer import palette
+from imitarm.viewer.canvas import INK, canvas
+from imitarm.viewer.page import Figure, Header, Tile, draw_page, render
+
+_SECONDS: Final = 8.0  # [s] of each drawing
+_WORDS: Final = {
+    "NIS": "Normalised innovation squared: how far detections are from their prediction, relative to the uncertainty.",
+    "NEES": "Normalised estimation error squared: how far the estimate is from the truth, relative to its uncertainty.",
+    "Lag": "Delay with which the estimate follows the truth.",
+    "Window": "One prediction and the true motion that followed it.",
+}
+
+
+def write_tracking_report(
+    motions: Sequence[RecordedMotion], tables: Sequence[Table], path: str | Path, *, provenance: Mapping[str, Any]
+) -> Path:
+    """Write the page and return its path.
+
+    Args:
+        motions: recordings to draw.
+        tables: tables that the command also prints.
+        path: the file to write; its folder must exist.
+        provenance: facts needed to repeat the benchmark.
+
+    Raises:
+        InputError: when the file can't be written, or the drawing libraries are not installed.
+        TaskFailedError: when the disk is full.
+    """
+    return draw_page(lambda: tracking_report_html(motions, tables, provenance=provenance), path)
+
+
+def tracking_report_html(
+    motions: Sequence[RecordedMotion], tables: Sequence[Table], *, provenance: Mapping[str, Any]
+) -> str:
+    """Return the whole page; see :func:`write_tracking_report`."""
+    figures, tiles = [], []
+    for motion in motions:
+        tracking = follow(motion, ObstacleTracker(), part=(0.5, 1.0))
+        for name, log in zip(motion.names, tracking.logs, strict=True):
+            raw, predicted = (_rms_mm(log, values) for values in (log.raw, log.predicted))
+            tiles.append(Tile(f"{predicted:.1f}", "mm", f"RMS error of the {name} (last detection: {raw:.1f} mm)"))
+            figures.append(
+                Figure(
+                    position_chart(log, name),
+                    f"Fig 5.9: position of the {name}",
+                    "(a) detections and estimate; (b) the same with the true position, as far as the detections reach.",
+                )
+            )
+    good = bool(tiles)
+    return render(
+        "avoidance.html",
+        Header(
+            "Tracking of moving obstacles", "Real motion with simulated noise, latency and dropouts", good, "", tiles
+        ),
+        data={"tables": [{"title": t.title, "columns": t.columns, "rows": t.rows, "note": t.note} for t in tables]},
+        data_name="imitarm-tracking.json",
+        provenance=provenance,
+        words=_WORDS,
+        figures=figures,
+        tables=[table.for_page() for table in tables],
+        scenes=[],
+    )
+
+
+def _rms_mm(log: TrackLog, values: Any) -> float:
+    used = log.settled & np.isfinite(values).all(axis=1)
+    return 1e3 * float(np.sqrt((((values - log.truth)[used]) ** 2).sum(axis=1).mean()))
+
+
+def position_chart(log: TrackLog, name: str) -> str:
+    """Draw detections, estimate and truth over time, one below the other as in Fig 5.9 (a) and (b)."""
+    with canvas(f"position-{name}", f"Detected, estimated and true position of the {name} over time", (5.5, 4.4)) as c:
+        upper, lower = c.axes(0.74, 2.55, 5.4, 4.2), c.axes(0.74, 0.72, 5.4, 2.35)
+        draw_positions(upper, lower, log, truth=INK)
+        c.legend(3)
+    return c.svg
+
+
+def draw_positions(upper: Any, lower: Any, log: TrackLog, *, truth: str = "black") -> None:
+    """Draw Fig 5.9 (a) and (b) on two matplotlib axes, along the axis with the largest motion.
+
+    Args:
+        upper: axes of (a): detections and estimate.
+        lower: axes of (b): detections, estimate and true position.
+        log: the log of one obstacle.
+        truth: colour of the true position.
+    """
+    shown = log.settled & (log.times < log.times[log.settled][0] + _SECONDS)
+    axis = int(np.ptp(log.truth[shown], axis=0).argmax())
+    times = log.times[shown] - log.times[shown][0]
+    middle = float(log.truth[shown, axis].mean())
+    for axes, text in ((upper, "(a)"), (lower, "(b)")):
+        mm = {key: 1e3 * (getattr(log, key)[shown, axis] - middle) for key in ("raw", "predicted", "truth")}
+        label = (lambda words: words) if axes is upper else (lambda words: None)
+        axes.plot(times, mm["raw"], color=palette.DEMONSTRATION, lw=0.9, label=label("last detection"))
+        axes.plot(times, mm["predicted"], color=palette.UNMOVED, lw=1.4, label=label("estimate of the tracker"))
+        if axes is lower:
+            axes.plot(times, mm["truth"], color=truth, lw=1.0, ls="--", label="true position")
+        axes.set_title(text, loc="left")
+        axes.set_ylabel(f"{'xyz'[axis]} [mm]")
+        axes.set_xlim(0.0, times[-1])
+    lower.set_xlabel("time [s]")
