@@ -147,9 +147,11 @@ def test_names_that_do_not_exist_are_noticed() -> None:
 
 
 def names_of_tests(path: Path) -> set[str]:
-    """The test functions in a file."""
+    """The test functions in a file, and the test methods of its test classes."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    return {node.name for node in tree.body if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")}
+    classes = [node for node in tree.body if isinstance(node, ast.ClassDef) and node.name.startswith("Test")]
+    nodes = [*tree.body, *(node for owner in classes for node in owner.body)]
+    return {node.name for node in nodes if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")}
 
 
 @each_page

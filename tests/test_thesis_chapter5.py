@@ -34,7 +34,7 @@ class TestTracking:
 
     def test_an_estimate_that_contains_the_noise_is_worse(self):
         """Eq 5.2 adds the noise of the motion to the estimate; a Kalman filter adds its covariance to P."""
-        _, tracks, truth = self.watched()
+        _, tracks, _ = self.watched()
         q, dt = 0.05, 1.0 / 30.0
         rng = np.random.default_rng(1)
         noise = rng.normal(0.0, np.sqrt(q * dt), (len(tracks), 3))  # of the velocity, for one step

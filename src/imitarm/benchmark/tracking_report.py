@@ -7,15 +7,21 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from imitarm.benchmark.tables import Table
 from imitarm.benchmark.tracked_motions import RecordedMotion
 from imitarm.benchmark.tracking import TrackLog, follow
-from imitarm.perception import ObstacleTracker
+from imitarm.benchmark.tracking_margins import COVERAGE, TIMES, synthetic_windows
+from imitarm.control_loop.observer import SensorModel
+from imitarm.perception import CoverageMargin, ObstacleTracker
 from imitarm.viewer import palette
 from imitarm.viewer.canvas import INK, canvas
 from imitarm.viewer.page import Figure, Header, Tile, draw_page, render
 
+Array = NDArray[np.float64]
+
+_WINDOWS: Final = 400  # of the drawing of margins
 _SECONDS: Final = 8.0  # [s] of each drawing
 _WORDS: Final = {
     "NIS": "Normalised innovation squared: how far detections are from their prediction, relative to the uncertainty.",
@@ -26,7 +32,12 @@ _WORDS: Final = {
 
 
 def write_tracking_report(
-    motions: Sequence[RecordedMotion], tables: Sequence[Table], path: str | Path, *, provenance: Mapping[str, Any]
+    motions: Sequence[RecordedMotion],
+    tables: Sequence[Table],
+    path: str | Path,
+    *,
+    sensor: SensorModel,
+    provenance: Mapping[str, Any],
 ) -> Path:
     """Write the page and return its path.
 
@@ -34,22 +45,23 @@ def write_tracking_report(
         motions: recordings to draw.
         tables: tables that the command also prints.
         path: the file to write; its folder must exist.
+        sensor: the sensor.
         provenance: facts needed to repeat the benchmark.
 
     Raises:
         InputError: when the file can't be written, or the drawing libraries are not installed.
         TaskFailedError: when the disk is full.
     """
-    return draw_page(lambda: tracking_report_html(motions, tables, provenance=provenance), path)
+    return draw_page(lambda: tracking_report_html(motions, tables, sensor=sensor, provenance=provenance), path)
 
 
 def tracking_report_html(
-    motions: Sequence[RecordedMotion], tables: Sequence[Table], *, provenance: Mapping[str, Any]
+    motions: Sequence[RecordedMotion], tables: Sequence[Table], *, sensor: SensorModel, provenance: Mapping[str, Any]
 ) -> str:
     """Return the whole page; see :func:`write_tracking_report`."""
     figures, tiles = [], []
     for motion in motions:
-        tracking = follow(motion, ObstacleTracker(), part=(0.5, 1.0))
+        tracking = follow(motion, ObstacleTracker(), sensor, (0.5, 1.0))
         for name, log in zip(motion.names, tracking.logs, strict=True):
             raw, predicted = (_rms_mm(log, values) for values in (log.raw, log.predicted))
             tiles.append(Tile(f"{predicted:.1f}", "mm", f"RMS error of the {name} (last detection: {raw:.1f} mm)"))
@@ -60,6 +72,14 @@ def tracking_report_html(
                     "(a) detections and estimate; (b) the same with the true position, as far as the detections reach.",
                 )
             )
+    figures.append(
+        Figure(
+            margin_chart(synthetic_windows(_WINDOWS, 0, sensor), synthetic_windows(_WINDOWS, 1, sensor)),
+            "Errors of predictions and their margin",
+            f"Errors of {_WINDOWS} synthetic windows, and the margin calibrated with {_WINDOWS} others. Dashed: "
+            "95 % of the errors at each look-ahead time alone; the margin covers whole windows, so it is larger.",
+        )
+    )
     good = bool(tiles)
     return render(
         "avoidance.html",
@@ -87,6 +107,24 @@ def position_chart(log: TrackLog, name: str) -> str:
         upper, lower = c.axes(0.74, 2.55, 5.4, 4.2), c.axes(0.74, 0.72, 5.4, 2.35)
         draw_positions(upper, lower, log, truth=INK)
         c.legend(3)
+    return c.svg
+
+
+def margin_chart(calibration: Array, test: Array) -> str:
+    """Draw prediction errors (n, n_times) [m] over the look-ahead time, with the margin from other windows."""
+    margin = CoverageMargin.calibrate(calibration, COVERAGE, times=TIMES)
+    with canvas("margin", "Errors of predictions over the look-ahead time, and their margin", (5.5, 2.6)) as c:
+        axes = c.axes(0.74, 0.78, 5.4, 2.5)
+        for error in test[:100]:
+            axes.plot(TIMES, 1e3 * error, color=palette.NOMINAL, lw=0.5, alpha=0.5)
+        each = 1e3 * np.quantile(test, COVERAGE, axis=0)
+        axes.plot(TIMES, each, color=palette.ADAPTED, lw=1.2, ls="--", label="95 % at each time")
+        axes.plot(TIMES, 1e3 * margin.at(TIMES), color=palette.LIMIT, lw=1.6, label="margin of synthetic windows")
+        axes.set_ylim(0.0, 1.4e3 * float(margin.at(TIMES[-1])))
+        axes.set_xlim(TIMES[0], TIMES[-1])
+        axes.set_xlabel("look-ahead time [s]")
+        axes.set_ylabel("error [mm]")
+        c.legend(2)
     return c.svg
 
 

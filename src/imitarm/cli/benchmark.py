@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import importlib.util
 import math
 import tempfile
@@ -20,8 +21,6 @@ from imitarm.benchmark.provenance import code_version, origin
 from imitarm.benchmark.recordings import KINDS
 from imitarm.benchmark.refusal_oracle import Answer
 from imitarm.cli.benchmark_options import add_fill, add_workers, place_of, report_tables, workers_of
-from imitarm.cli.benchmark_static import add_static
-from imitarm.cli.benchmark_tracking import add_tracking
 from imitarm.cli.outputs import check_outputs, same_place
 from imitarm.cli.robot_options import add_robot_options
 from imitarm.cli.run_scene import provenance
@@ -29,6 +28,9 @@ from imitarm.cli.screen import progress_bar, remark, say
 from imitarm.errors import InputError
 from imitarm.policies import POLICIES
 from imitarm.policies.adaptation import ADAPTERS
+
+OTHERS = ("imitarm.cli.benchmark_static:add_static", "imitarm.cli.benchmark_tracking:add_tracking")
+"""Benchmarks with a file of their own: the functions that add their parsers."""
 
 EPILOG = """\
 examples:
@@ -116,8 +118,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_fill(third)
     third.set_defaults(benchmark=_refusals)
     _add_placements(parsers)
-    add_static(parsers)
-    add_tracking(parsers)
+    for member in OTHERS:
+        module, _, function = member.partition(":")
+        getattr(importlib.import_module(module), function)(parsers)
     people = parsers.add_parser("people", help="retarget recordings of real people to simulated arms")
     people.add_argument(
         "data",

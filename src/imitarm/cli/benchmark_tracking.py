@@ -47,8 +47,8 @@ def _run(arguments: argparse.Namespace) -> int:
     """Print the tables, and write files."""
     place = place_of(arguments, "tracking")
     check_outputs([("--report", arguments.report)], [("--fill", arguments.fill)])
-    if arguments.windows < 100:
-        raise InputError(f"--windows must be at least 100, got {arguments.windows}")
+    if arguments.windows < 200:
+        raise InputError(f"--windows must be at least 200, got {arguments.windows}")
     sensor = replace(SENSOR, noise=1e-3 * arguments.noise, dropout=0.01 * arguments.dropout, seed=arguments.seed)
     motions = [] if arguments.data is None else recorded_motions(arguments.data)
     if not motions:
@@ -61,5 +61,5 @@ def _run(arguments: argparse.Namespace) -> int:
         from imitarm.cli.run_scene import provenance  # noqa: PLC0415
 
         facts = provenance(results=origin([code_version()]))
-        say(f"wrote {write_tracking_report(motions, tables, arguments.report, provenance=facts)}")
+        say(f"wrote {write_tracking_report(motions, tables, arguments.report, sensor=sensor, provenance=facts)}")
     return 0
