@@ -20,6 +20,7 @@ from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.damped_ik import damped_least_squares, damped_with_small_angle, filtered_svd
 from imitarm.kinematics.ik_problem import Box, IKProblem, Rows, TaskRows
+from imitarm.kinematics.least_violation import least_violation
 from imitarm.kinematics.limits import JointLimits, Limit
 from imitarm.kinematics.tasks import PostureTask, Task, TwistTask
 from imitarm.validation import choice, finite_number, finite_vector, instance, sequence
@@ -353,9 +354,11 @@ def _least_cost(box: Box, matrix: Array | None, least: Array | None, hessian: Ar
         lower[:n], lower[n:], upper[:n], upper[n:] = box.lower, least, box.upper, 1e30
     velocity, _, status, _ = daqp.solve(hessian, -linear, matrix, upper, lower, _plain(len(lower)))
     if status <= 0 and len(least):
-        moved = np.sqrt(np.einsum("ij,ij->i", matrix, matrix)) > _TINY_ROW  # no velocity changes the other rows
-        matrix, least = matrix[moved], least[moved]
-        nearest, reached = _least_violation(box, matrix, least)
+        lengths = np.sqrt(np.einsum("ij,ij->i", matrix, matrix))
+        moved = lengths > _TINY_ROW  # no velocity changes the other rows
+        matrix, least, lengths = matrix[moved], least[moved], lengths[moved]
+        nearest = least_violation(box, matrix / lengths[:, None], least / lengths)
+        reached = np.minimum(least, matrix @ nearest - _ROUNDING * lengths)
         lower, upper = np.append(box.lower, reached), np.append(box.upper, np.full(len(reached), 1e30))
         velocity, _, status, _ = daqp.solve(hessian, -linear, matrix, upper, lower, _plain(len(lower)))
         if status <= 0:
@@ -364,23 +367,6 @@ def _least_cost(box: Box, matrix: Array | None, least: Array | None, hessian: Ar
         velocity = np.zeros(n)
     velocity = np.maximum(velocity, box.lower)
     return np.minimum(velocity, box.upper, out=velocity)
-
-
-def _least_violation(box: Box, matrix: Array, least: Array) -> tuple[Array, Array]:
-    """Return the velocity with the least squared violation of contradictory rows, and the bounds that it satisfies.
-
-    Each row gets a slack variable. daqp's own soft constraints need no slack variables, but at active bounds their
-    solutions violate rows that could be kept (observed with version 0.11).
-    """
-    m, n = matrix.shape
-    lengths = np.sqrt(np.einsum("ij,ij->i", matrix, matrix))
-    hessian = np.diag(np.append(np.full(n, _EFFORT), np.ones(m)))
-    rows = np.hstack([matrix / lengths[:, None], np.eye(m)])
-    lower, upper = np.full(n + 2 * m, -1e30), np.full(n + 2 * m, 1e30)
-    lower[:n], upper[:n], lower[n + m :] = box.lower, box.upper, least / lengths
-    solution, _, status, _ = daqp.solve(hessian, np.zeros(n + m), rows, upper, lower, _plain(n + 2 * m))
-    velocity = np.clip(solution[:n] if status > 0 else np.zeros(n), box.lower, box.upper)
-    return velocity, np.minimum(least, matrix @ velocity - _ROUNDING * lengths)
 
 
 def _unconstrained(box: Box, matrix: Array | None, least: Array | None, hessian: Array, linear: Array) -> Array | None:
