@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,15 +14,35 @@ from imitarm.command import Command
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik import IKSolver
 from imitarm.kinematics.ik_problem import Rows
+from imitarm.kinematics.least_violation import least_violation
 from imitarm.kinematics.limits import Limit
 from imitarm.kinematics.tasks import ElbowTask, JointVelocityTask, PostureTask, Task, TwistTask
-from imitarm.scene.clearance import ClearanceLimit, SelfClearance
+from imitarm.perception.margins import CoverageMargin
+from imitarm.scene.clearance import ClearanceLimit, NearRows, SelfClearance
 from imitarm.scene.scene import Scene
 from imitarm.validation import finite_number, finite_vector, instance
 
 Array = NDArray[np.float64]
 
 _KEPT = 1e-6  # [m/s] a row that is missed by less is kept: what rounding leaves
+_ROUNDING = 1e-9  # [m/s]
+
+
+class Cause(NamedTuple):
+    """Why a safety filter changed a command: the two parts that the command would have brought too near.
+
+    Attributes:
+        link: name of the part of the arm, as in the robot's file.
+        other: name of the obstacle, or of another link.
+        room: distance of the two minus the required clearance [m].
+    """
+
+    link: str
+    other: str
+    room: float
+
+    def __str__(self) -> str:
+        return f"{self.link} and {self.other}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +56,19 @@ class SafetyStep:
         slack: largest violation of a clearance inequality [m/s]; 0 when all inequalities are kept.
         safe: whether ``velocity`` keeps every limit and every clearance inequality; if False, no joint velocity keeps
             them all.
+        cause: the pair for which the filter had to change the command most; None when it changed nothing.
     """
 
     velocity: Array
     changed: float
     slack: float
     safe: bool
+    cause: Cause | None = None
+
+    @property
+    def intervened(self) -> bool:
+        """Whether the filter changed the command to keep a clearance."""
+        return self.cause is not None
 
 
 class SafetyFilter:
@@ -51,10 +79,18 @@ class SafetyFilter:
 
     * The velocity always stays inside the position, velocity and acceleration limits of the joints.
     * No part of the arm approaches an obstacle faster than :class:`~imitarm.scene.clearance.ClearanceLimit` allows, and
-      no link approaches another link faster than :class:`~imitarm.scene.clearance.SelfClearance` allows.
+      no link approaches another link faster than :class:`~imitarm.scene.clearance.SelfClearance` allows. An arm at rest
+      yields to an obstacle that moves towards it.
 
-    If these clearance inequalities contradict the joint limits, no safe motion exists. The velocity then violates the
-    inequalities as little as possible, which moves the arm away from objects that are too close, and ``safe`` is False.
+    If these inequalities :math:`A \dot q \ge b` contradict the joint limits, no safe motion exists, and ``safe`` is
+    False. The command is then dropped, and the velocity is the one with the least squared violation of the
+    inequalities [m/s] among all velocities that approach nothing faster than full braking would:
+
+    .. math:: A\, \dot q \;\ge\; \min(b,\; A\, \dot q_b), \qquad \dot q_b = \dot q_p \max(0, 1 - dt / t_b)
+
+    Here, :math:`\dot q_p` is the previous velocity, and :math:`t_b = \max_j |\dot q_{p,j}| / a_j` the time in which all
+    joints together can brake to rest. If a hit can't be avoided, the arm therefore recedes as fast as it can, or at
+    least brakes as hard as it can.
 
     The same filter serves every policy and teleoperation.
 
@@ -67,6 +103,11 @@ class SafetyFilter:
         limits: limits of the inverse kinematics; None: position, velocity and acceleration of each joint.
         method: method of the inverse kinematics; only ``"qp"`` keeps clearances, so with another method both clearances
             must be None.
+        latency: time between a command and the motion of the arm [s].
+        margin: distance by which each clearance is enlarged for the error of a predicted obstacle; it is evaluated at
+            the obstacle's age (time since it was seen) plus ``latency``. None: predictions count as exact.
+        deviations: number of standard deviations of an obstacle's position by which the clearance is enlarged as well,
+            for obstacles with a covariance.
 
     Raises:
         InputError: when a number can't be used, or the method can't keep a required clearance.
@@ -82,6 +123,9 @@ class SafetyFilter:
         self_clearance: float | None = 0.01,
         limits: Sequence[Limit] | None = None,
         method: str = "qp",
+        latency: float = 0.0,
+        margin: CoverageMargin | None = None,
+        deviations: float = 0.0,
     ) -> None:
         self.solver = IKSolver(arm, limits, dt=dt, method=method)
         self.arm, self.dt = arm, self.solver.dt
@@ -89,7 +133,13 @@ class SafetyFilter:
             None if clearance is None else finite_number(clearance, "SafetyFilter: clearance", "m", at_least=0.0)
         )
         allowance = finite_number(allowance, "SafetyFilter: allowance", "m", at_least=0.0)
-        self._obstacles = None if self.clearance is None else ClearanceLimit(arm, self.clearance + allowance)
+        self.latency = finite_number(latency, "SafetyFilter: latency", "s", at_least=0.0)
+        self.margin = None if margin is None else instance(margin, CoverageMargin, "SafetyFilter: margin")
+        deviations = finite_number(deviations, "SafetyFilter: deviations", at_least=0.0)
+        self._obstacles: ClearanceLimit | None = None
+        if self.clearance is not None:
+            delay = self.dt + self.latency
+            self._obstacles = ClearanceLimit(arm, self.clearance + allowance, delay=delay, deviations=deviations)
         self._own = None if self_clearance is None else SelfClearance(arm, self_clearance)
 
     def step(self, command: Command, q: ArrayLike, velocity: ArrayLike | None, scene: Scene) -> SafetyStep:
@@ -107,29 +157,79 @@ class SafetyFilter:
         """
         instance(command, Command, "SafetyFilter.step: command")
         instance(scene, Scene, "SafetyFilter.step: scene")
-        position = finite_vector(q, self.arm.n_joints, "SafetyFilter.step: q", "rad")
-        rows = self._rows(position, scene)
-        if command.joint_velocity is not None and self._admits(position, command.joint_velocity, velocity, rows):
-            return SafetyStep(command.joint_velocity, 0.0, 0.0, True)
+        n = self.arm.n_joints
+        position = finite_vector(q, n, "SafetyFilter.step: q", "rad")
+        previous = None if velocity is None else finite_vector(velocity, n, "SafetyFilter.step: velocity", "rad/s")
+        near, own = self._near(position, previous, scene)
+        rows = [*([] if near is None else [near.rows]), *([] if own is None else [own])]
+        wanted = command.joint_velocity
+        if wanted is not None and self._admits(position, wanted, previous, rows):
+            return SafetyStep(wanted, 0.0, 0.0, True)
         tasks = _tasks(command)
-        allowed = self.solver.solve(position, tasks, velocity=velocity, rows=rows)
-        missing = max((float((part.lower - part.matrix @ allowed).max()) for part in rows), default=-math.inf)
-        changed = 0.0
-        if missing > -_KEPT:  # a row is active, or violated
-            alone = self.solver.solve(position, tasks, velocity=velocity)
-            changed = float(np.linalg.norm(allowed - alone))
-        return SafetyStep(allowed, changed, max(missing, 0.0), missing <= _KEPT)
+        allowed = self.solver.solve(position, tasks, velocity=previous, rows=rows)
+        missing = _missing(rows, allowed)
+        if missing <= -_KEPT:  # no row is active
+            return SafetyStep(allowed, 0.0, 0.0, True)
+        alone = self.solver.solve(position, tasks, velocity=previous)
+        if missing > _KEPT:
+            allowed = self._retreat(position, previous, rows)
+            missing = _missing(rows, allowed)
+        changed = float(np.linalg.norm(allowed - alone))
+        return SafetyStep(
+            allowed, changed, max(missing, 0.0), missing <= _KEPT, self._cause(position, scene, near, own, alone)
+        )
 
-    def _admits(self, q: Array, wanted: Array, velocity: ArrayLike | None, rows: list[Rows]) -> bool:
+    def _near(self, q: Array, velocity: Array | None, scene: Scene) -> tuple[NearRows | None, Rows | None]:
+        """Return the rows of obstacles, and those of the arm's own links."""
+        near = None
+        if self._obstacles is not None:
+            margins = None
+            if self.margin is not None:
+                ages = np.maximum(scene.stamp - scene.packed.stamps, 0.0)
+                margins = np.asarray(self.margin.at(ages + self.latency), dtype=float)
+            near = self._obstacles.near(q, scene, velocity, margins)
+        return near, None if self._own is None else self._own.rows(q)
+
+    def _admits(self, q: Array, wanted: Array, velocity: Array | None, rows: list[Rows]) -> bool:
         """Return whether a joint velocity already keeps all limits and inequalities."""
         box = self.solver.problem(q, JointVelocityTask(wanted), velocity).box
         inside = bool((wanted >= box.lower).all() and (wanted <= box.upper).all())
         return inside and all(bool((part.matrix @ wanted >= part.lower).all()) for part in rows)
 
-    def _rows(self, q: Array, scene: Scene) -> list[Rows]:
-        obstacles = None if self._obstacles is None else self._obstacles.rows(q, scene)
-        own = None if self._own is None else self._own.rows(q)
-        return [part for part in (obstacles, own) if part is not None]
+    def _retreat(self, q: Array, velocity: Array | None, rows: list[Rows]) -> Array:
+        """Return the velocity with the least violation of the rows that approaches nothing faster than full braking."""
+        n = self.arm.n_joints
+        box = self.solver.problem(q, JointVelocityTask(np.zeros(n)), velocity).box
+        braked = np.zeros(n)
+        if velocity is not None:
+            time = float((np.abs(velocity) / self.arm.max_acceleration).max())
+            braked = velocity * max(0.0, 1.0 - self.dt / max(time, self.dt))
+        braked = np.clip(braked, box.lower, box.upper)
+        matrix = np.concatenate([part.matrix for part in rows])
+        least = np.concatenate([part.lower for part in rows])
+        floor = np.minimum(least, matrix @ braked) - _ROUNDING
+        return least_violation(box, matrix, least, floor)
+
+    def _cause(self, q: Array, scene: Scene, near: NearRows | None, own: Rows | None, wanted: Array) -> Cause | None:
+        """Return the pair whose row ``wanted`` violates most; None if it violates none."""
+        worst, cause = _KEPT, None
+        if near is not None:
+            short = near.rows.lower - near.rows.matrix @ wanted
+            i = int(short.argmax())
+            if short[i] > worst:
+                link, other = self.arm.cover.bodies[near.sphere[i]], scene.name_of(int(near.obstacle[i]))
+                worst, cause = float(short[i]), Cause(link, other, float(near.room[i]))
+        if own is not None and self._own is not None:
+            short = own.lower - own.matrix @ wanted
+            i = int(short.argmax())
+            if short[i] > worst:
+                cause = Cause(*self._own.names_of(q, i))
+        return cause
+
+
+def _missing(rows: list[Rows], velocity: Array) -> float:
+    """Return the largest violation of any row [m/s]; negative if all rows are kept with room to spare."""
+    return max((float((part.lower - part.matrix @ velocity).max()) for part in rows), default=-math.inf)
 
 
 def _tasks(command: Command) -> list[Task]:

@@ -303,6 +303,18 @@ class SelfClearance:
         outer, inner, _, _, distances = self._found(q)
         return np.stack((outer, inner), axis=1), distances
 
+    def names_of(self, q: ArrayLike, row: int) -> tuple[str, str, float]:
+        """Return the names of the two links of a row of :meth:`rows`, and their distance minus the clearance [m].
+
+        Args:
+            q: joint positions, shape (n_joints,) [rad].
+            row: index of the row.
+        """
+        pairs, distances = self.nearest(q)
+        bodies = self.arm.cover.bodies
+        first, second = (bodies[i] if i < len(bodies) else "base" for i in pairs[row].tolist())
+        return first, second, float(distances[row]) - self.clearance
+
     def rows(self, q: ArrayLike) -> Rows | None:
         """Return inequalities on the joint velocity for ``solve_ik(..., rows=...)``.
 
