@@ -120,6 +120,11 @@ class ArmAmongObstacles:
         other._pairs = [pairs.without_margin() for pairs in self._pairs]
         return other
 
+    @property
+    def fastest_obstacle(self) -> float:
+        """Speed of the fastest obstacle [m/s]; 0 if none moves."""
+        return max((float(np.linalg.norm(pairs.velocity)) for pairs in self._pairs), default=0.0)
+
     def gaps(self, path: ArmPath, times: Array, reach: float, *, connected: bool = True) -> Gaps:
         """Return, for each sample, the pairs whose distance is below the required clearance plus ``reach``.
 

@@ -23,6 +23,7 @@ from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_path import ArmPath
 from imitarm.policies.arm_certificate import ArmAmongObstacles, Shrinking
 from imitarm.policies.arm_pairs import SELF
+from imitarm.scene.braking import APPROACH_RATE, LONGEST_YIELD, shrink_rates
 
 Array = NDArray[np.float64]
 
@@ -35,8 +36,10 @@ _ROUNDING = 1e-9
 _NO_EFFECT = 1e-9  # a coefficient smaller than this does not limit a
 _SLOWEST = 1e-6  # squared speed below which the path counts as blocked
 _FILTER_SELF, _FILTER_MARGIN = 0.01, 1e-3  # [m] that the safety filter keeps between links; that it adds to a clearance
-_APPROACH_RATE, _SELF_RATE = 5.4, 4.5  # [1/s] distances shrink no faster than this times what is left; the filter: 6, 5
-_REACH = 0.15  # [m] pairs farther apart than the clearance and this do not slow the motion
+_USED = 0.9  # fraction that is used of the rates at which the safety filter lets distances shrink
+_SELF_RATE = 5.0  # [1/s] that rate between links
+_DELAY = 0.02  # [s] of the commands: twice the usual control period
+_REACH = 0.15  # [m] pairs farther apart than the clearance and this do not slow the motion among resting obstacles
 _CREEP = 1e-3  # [m/s] closing speed that is always allowed, so that the motion goes on
 
 
@@ -100,6 +103,8 @@ def safe_rates(
 ) -> Array:
     """Return the largest rate ds/dt at each sample at which no distance shrinks faster than the safety filter allows.
 
+    The distances may shrink at nine tenths of the rates of the filter's own rows
+    (:func:`~imitarm.scene.braking.shrink_rates`).
     The safety filter measures distances to where the obstacles are predicted, so margins are left out. An obstacle that
     approaches by itself does not slow the motion down: the arm would still be in its way. The path and its times must
     keep the clearance in that case.
@@ -117,12 +122,18 @@ def safe_rates(
         Shape (n,), at most 1.
     """
     velocity = np.gradient(path.joints, times, axis=0)
-    obstacles = Shrinking(_APPROACH_RATE, max(allowance - _FILTER_MARGIN, 0.0), _REACH)
-    links = Shrinking(_SELF_RATE, SELF_CLEARANCE - _FILTER_SELF, _REACH)
+    fastest_obstacle, slowest = around.fastest_obstacle, APPROACH_RATE
+    if fastest_obstacle > 0.0:
+        slowest = 1.0 / (_DELAY + 0.5 * LONGEST_YIELD)
+    reach = _REACH + 0.5 * LONGEST_YIELD * fastest_obstacle
+    obstacles = Shrinking(_USED * slowest, max(allowance - _FILTER_MARGIN, 0.0), reach)
+    links = Shrinking(_USED * _SELF_RATE, SELF_CLEARANCE - _FILTER_SELF, _REACH)
     gaps = around.without_margins.closing(path, clock, velocity, obstacles, links)
     own = gaps.obstacle == SELF
-    rate, margin, _ = (np.where(own, a, b) for a, b in zip(links, obstacles, strict=True))
+    margin = np.where(own, links.margin, obstacles.margin)
     rates, drift = gaps.rates(np.arange(len(gaps)))
+    shrinking = shrink_rates(path.arm, rates, -drift, velocity[gaps.sample], delay=_DELAY)
+    rate = _USED * np.where(own, _SELF_RATE, shrinking)
     allowed = np.maximum(rate * (np.maximum(gaps.room, 0.0) + margin) + np.maximum(drift, 0.0), _CREEP)
     approach = np.maximum(-np.einsum("kj,kj->k", rates, velocity[gaps.sample]), 1e-9)
     fastest = np.ones(len(path))

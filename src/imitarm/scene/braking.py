@@ -51,18 +51,21 @@ def shrink_rates(
         arm: the arm, with its limits of velocity and acceleration.
         gradients: derivatives of k distances with respect to the joints, shape (k, n_joints) [m/rad].
         approach: speed at which each obstacle approaches, shape (k,) [m/s]; None: all are at rest.
-        velocity: joint velocity, shape (n_joints,) [rad/s]; None: at rest.
+        velocity: joint velocity, one of shape (n_joints,) or one for each distance (k, n_joints) [rad/s]; None: at
+            rest.
         most: largest result [1/s].
         delay: T, the control period plus the latency, one number or of shape (k,) [s].
 
     Returns:
         Shape (k,), or one number for all if all obstacles are at rest.
     """
-    time = 0.0 if velocity is None else float((np.abs(velocity) / arm.max_acceleration).max())
+    time: Array | float = 0.0
+    if velocity is not None:
+        time = (np.abs(velocity) / arm.max_acceleration).max(axis=-1)
     if approach is None or approach.max(initial=0.0) <= 0.0:
         return np.minimum(most, 1.0 / (delay + 0.5 * time))
     reach = np.abs(gradients)
     times = approach / np.maximum(_SHARE * (reach @ arm.max_acceleration), 1e-9)
     times[(approach <= 0.0) | (approach > reach @ arm.max_velocity)] = 0.0
-    np.clip(times, time, max(time, LONGEST_YIELD), out=times)
+    times = np.maximum(np.minimum(times, LONGEST_YIELD), time)
     return np.minimum(most, 1.0 / (delay + 0.5 * times))

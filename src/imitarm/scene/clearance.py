@@ -1,19 +1,18 @@
-"""Inequalities for the inverse kinematics that keep an arm clear of obstacles, and its links clear of each other."""
+"""Inequalities for the inverse kinematics that keep the links of an arm clear of each other."""
 
 from __future__ import annotations
 
+import hashlib
 import math
-from typing import NamedTuple
+from functools import lru_cache
 
+import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik_problem import Rows
-from imitarm.scene.braking import APPROACH_RATE, LONGEST_YIELD, shrink_rates
-from imitarm.scene.distances import PackedObstacles, near_pairs
-from imitarm.scene.meeting_links import meeting_links
-from imitarm.scene.scene import Scene
+from imitarm.kinematics.spheres import COLLISION_GROUP
 from imitarm.validation import finite_number, instance, whole_number
 
 Array = NDArray[np.float64]
@@ -24,193 +23,12 @@ _INFLUENCE = 0.15  # [m] beyond the clearance: two links farther apart have no r
 _NEAR = 0.06  # [m] beyond the clearance: every two spheres nearer than this have a row
 _MOST = 64  # rows of such spheres at most, the nearest
 _RETREAT_RATE = 25.0  # [1/s] how fast missing clearance is regained
-_STEP = 0.05  # [m] steps in which the distance is extended within which obstacles have rows
-_UNMOVED = 1e-6  # [m/rad] a joint that changes a distance by less does not change it
+_FEW = 3  # links with more joints between them are assumed to meet: there are too many postures to try
+_POSTURES = 512  # tried for each pair of links
 
 
-class NearRows(NamedTuple):
-    """The rows of :class:`ClearanceLimit`, and the pair of a sphere and an obstacle to which each belongs.
-
-    Attributes:
-        rows: inequalities on the joint velocity.
-        obstacle: index of the obstacle, shape (k,).
-        sphere: index of the sphere of the arm, shape (k,).
-        room: remaining distance h, shape (k,) [m].
-    """
-
-    rows: Rows
-    obstacle: Indices
-    sphere: Indices
-    room: Array
-
-
-class ClearanceLimit:
-    r"""Inequalities on the joint velocity that keep a clearance between every link (and the tool) and every obstacle.
-
-    Spheres cover the arm and its tool (``ArmModel.collision_spheres``). Let ``c`` and ``r`` be the centre and the
-    radius of a sphere near an obstacle with the signed distance ``sd`` and the outward normal ``n``. The remaining
-    distance is ``h = sd(c) - r - clearance``. Let ``v_o`` be the velocity of the obstacle's nearest point. The row for
-    this sphere is the following inequality on :math:`\dot q`:
-
-    .. math:: n^T J(q)\, \dot q \;\ge\; n^T v_o - k h, \qquad k = \min\Big(\xi,\; \frac1{T + t/2}\Big)
-
-    The row lets h shrink at most exponentially, and only so fast that the arm can still brake, or yield to the
-    obstacle, before h is used up: t is the time that the joints need for this, and T the delay of the commands
-    (:func:`~imitarm.scene.braking.shrink_rates`). For obstacles at rest, k is nearly always :math:`\xi`. Before a fast
-    obstacle, and for links that the joints accelerate only slowly, k is smaller, so the arm yields earlier. In theory h
-    stays positive. In practice h can become negative, because links move on arcs and control steps are finite. While h
-    is negative, ``retreat_rate`` replaces k, and h must grow.
-
-    Every sphere within ``influence`` of an obstacle has a row; none is left out, except rows that no velocity within
-    the limits of the joints can violate. The spheres contain the shapes they cover, so the true distance is never
-    smaller than the distance of the spheres.
-
-    Args:
-        arm: arm with its tool.
-        clearance: required distance of every link to every obstacle [m].
-        rate: ``xi``; while h is positive, it may shrink by at most this fraction of itself per second [1/s].
-        influence: value of h beyond which a sphere has no row [m]. It is extended by 0.75 s times the speed of the
-            fastest obstacle.
-        retreat_rate: while h is negative, it must grow by at least this fraction of its magnitude per second [1/s].
-        delay: T, the control period plus the latency of the arm [s]; the age of each obstacle is added.
-        deviations: number of standard deviations of each obstacle's position along the normal that are subtracted from
-            its distance, from the obstacle's covariance.
-
-    Raises:
-        InputError: when ``arm`` is not an ArmModel, or a number is not finite or is negative.
-    """
-
-    def __init__(
-        self,
-        arm: ArmModel,
-        clearance: float,
-        *,
-        rate: float = APPROACH_RATE,
-        influence: float = 0.15,
-        retreat_rate: float = 25.0,
-        delay: float = 0.01,
-        deviations: float = 0.0,
-    ) -> None:
-        self.arm = instance(arm, ArmModel, "ClearanceLimit: arm")
-        self.clearance = finite_number(clearance, "ClearanceLimit: clearance", "m", at_least=0.0)
-        self.rate = finite_number(rate, "ClearanceLimit: rate", "1/s", at_least=0.0)
-        self.retreat_rate = finite_number(retreat_rate, "ClearanceLimit: retreat_rate", "1/s", at_least=0.0)
-        self.influence = finite_number(influence, "ClearanceLimit: influence", "m", above=0.0)
-        self.delay = finite_number(delay, "ClearanceLimit: delay", "s", above=0.0)
-        self.deviations = finite_number(deviations, "ClearanceLimit: deviations", at_least=0.0)
-        cover = arm.cover
-        self._cover = cover
-        self._reduced = cover.radii + self.clearance  # [m] what is taken off a distance
-        self._reaches = {0: self._reduced + self.influence}  # by the speed of the fastest obstacle, in 0.1 m/s
-
-    def rows(self, q: ArrayLike, scene: Scene, velocity: ArrayLike | None = None) -> Rows | None:
-        """Return the inequalities for one posture.
-
-        Args:
-            q: joint positions, shape (n_joints,) [rad].
-            scene: obstacles predicted for the current time, with their velocities.
-            velocity: joint velocity, shape (n_joints,) [rad/s]; None: at rest.
-
-        Returns:
-            One row for each pair of a sphere and an obstacle within ``influence``; None when there is no pair. A pair
-            that is too close has no row if no joint can change its distance.
-
-        Raises:
-            InputError: when ``q`` is not n_joints finite numbers.
-        """
-        found = self.near(q, scene, velocity)
-        return None if found is None else found.rows
-
-    def near(
-        self, q: ArrayLike, scene: Scene, velocity: ArrayLike | None = None, margins: Array | None = None
-    ) -> NearRows | None:
-        """Return the inequalities and the pairs to which they belong; same arguments and errors as :meth:`rows`.
-
-        Args:
-            q: joint positions, shape (n_joints,) [rad].
-            scene: obstacles predicted for the current time, with their velocities.
-            velocity: joint velocity, shape (n_joints,) [rad/s]; None: at rest.
-            margins: distance added to the clearance of each obstacle, shape (n_obstacles,) [m]; None: nothing.
-        """
-        packed = scene.packed
-        if not len(packed):
-            return None
-        data = self.arm.at(q).data
-        centers = self._cover.centers(data)
-        pairs = near_pairs(packed, centers, self._reach(packed, margins))
-        if pairs is None:
-            return None
-        obstacle, sphere, distance, normal = pairs
-        points = centers.take(sphere, axis=0).T
-        matrix = self._cover.speeds(data, sphere, points, normal)
-        room = distance - self._reduced.take(sphere)
-        if margins is not None:
-            room -= margins.take(obstacle)
-        if self.deviations and packed.covariances.any():
-            spread = np.einsum("ik,kij,jk->k", normal, packed.covariances.take(obstacle, axis=0), normal)
-            room -= self.deviations * np.sqrt(np.maximum(spread, 0.0))
-        approach = _approach(packed, obstacle, points, normal)
-        lower = self._lower(scene, matrix, obstacle, room, approach, velocity)
-        return self._kept(matrix, lower, obstacle, sphere, room)
-
-    def _reach(self, packed: PackedObstacles, margins: Array | None) -> Array:
-        """Return the distance of each sphere's centre within which obstacles have rows; the same array if possible."""
-        if packed.still and margins is None and not self.deviations:
-            return self._reaches[0]
-        fastest = math.sqrt(float(np.einsum("ij,ij->i", packed.velocities, packed.velocities).max()))
-        more = 0.5 * LONGEST_YIELD * fastest + (0.0 if margins is None else max(float(margins.max()), 0.0))
-        if self.deviations:
-            more += self.deviations * math.sqrt(float(packed.covariances.trace(axis1=1, axis2=2).max()))
-        steps = math.ceil(more / _STEP)
-        if steps not in self._reaches:
-            self._reaches[steps] = self._reaches[0] + _STEP * steps
-        return self._reaches[steps]
-
-    def _lower(
-        self,
-        scene: Scene,
-        matrix: Array,
-        obstacle: Indices,
-        room: Array,
-        approach: Array | None,
-        velocity: ArrayLike | None,
-    ) -> Array:
-        """Return the lower bounds of the rows, shape (k,) [m/s]."""
-        speed = None if velocity is None else np.asarray(velocity, dtype=float)
-        packed = scene.packed
-        delay: Array | float = self.delay
-        if approach is not None:
-            delay += np.maximum(scene.stamp - packed.stamps, 0.0).take(obstacle)
-        rates = shrink_rates(self.arm, matrix, approach, speed, most=self.rate, delay=delay)
-        lower = -rates * room
-        lower -= (self.retreat_rate - rates) * np.minimum(room, 0.0)
-        if approach is not None:
-            lower += approach
-        return lower
-
-    def _kept(self, matrix: Array, lower: Array, obstacle: Indices, sphere: Indices, room: Array) -> NearRows | None:
-        """Leave out rows that no velocity can violate, and links that are too close and that no joint moves away."""
-        most = np.abs(matrix) @ self.arm.max_velocity
-        kept = lower > -most
-        if lower.max() > 0.0:  # a link that no joint moves away, such as one that turns in place above a table
-            kept &= (lower <= 0.0) | (np.einsum("ij,ij->i", matrix, matrix) > _UNMOVED**2)
-        if not kept.all():
-            if not kept.any():
-                return None
-            matrix, lower = matrix[kept], lower[kept]
-            obstacle, sphere, room = obstacle[kept], sphere[kept], room[kept]
-        return NearRows(Rows(matrix, lower), obstacle, sphere, room)
-
-
-def _approach(packed: PackedObstacles, obstacle: Indices, points: Array, normal: Array) -> Array | None:
-    """Return the speed of each obstacle's nearest point along the normal, shape (k,) [m/s]; None if none moves."""
-    if packed.still:
-        return None
-    velocity = packed.velocities.take(obstacle, axis=0).T
-    if packed.rotating:  # the nearest surface point p moves at v + w x (p - origin); c - p is along n
-        arms = points - packed.positions.take(obstacle, axis=0).T
-        velocity = velocity + np.cross(packed.angular_velocities.take(obstacle, axis=0).T, arms, axis=0)
-    return np.asarray(np.einsum("ij,ij->j", velocity, normal))
+_known: dict[bytes, NDArray[np.bool_]] = {}  # by the content of the model: an arm that is loaded again is the same
+_MOST_KNOWN = 64
 
 
 class SelfClearance:
@@ -426,3 +244,77 @@ class PeriodicSelfClearance:
             return None
         matrix, room = self._found
         return Rows(matrix, self._own.lower(room + matrix.dot(q - self._at)))
+
+
+@lru_cache(maxsize=16)
+def meeting_links(arm: ArmModel) -> NDArray[np.bool_]:
+    """Return for every pair of links whether they can touch within the limits of the joints between them.
+
+    Link 0 is the base; link k is moved by k joints. Neighbouring links are always reported as not meeting. For links
+    with two or three joints between them, the distance of their exact shapes is measured in 512 postures that fill the
+    ranges of these joints evenly (a Sobol sequence). Links that touch in none of these postures are reported as not
+    meeting. Links with four or more joints between them are always reported as meeting.
+
+    Args:
+        arm: the arm with its tool.
+
+    Returns:
+        A read-only array of shape (n_joints + 1, n_joints + 1). The answer for two links is at [outer, inner] with
+        outer > inner; all other entries are False.
+    """
+    model = arm.spec().compile()
+    content = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    key = hashlib.sha256(content.tobytes() + arm.home.tobytes() + repr(arm.joint_names).encode()).digest()
+    if key not in _known:
+        while len(_known) >= _MOST_KNOWN:
+            _known.pop(next(iter(_known)))
+        _known[key] = _measured(arm, model)
+    return _known[key]
+
+
+def _measured(arm: ArmModel, model: mujoco.MjModel) -> NDArray[np.bool_]:
+    n = arm.n_joints
+    meet = np.tril(np.ones((n + 1, n + 1), dtype=bool), -2)
+    data, shapes = mujoco.MjData(model), _shapes(arm, model)
+    for outer in range(2, n + 1):
+        for inner in range(max(outer - _FEW, 0), outer - 1):
+            meet[outer, inner] = _touch(arm, model, data, (shapes[outer], shapes[inner]), slice(inner, outer))
+    meet.setflags(write=False)
+    return meet
+
+
+def _shapes(arm: ArmModel, model: mujoco.MjModel) -> list[list[int]]:
+    """Return the collision shapes of each link, beginning with the base."""
+    joints = [model.joint(name).id for name in arm.joint_names]
+    carriers = [int(model.jnt_bodyid[joint]) for joint in joints]
+    shapes: list[list[int]] = [[] for _ in range(arm.n_joints + 1)]
+    for geom in np.flatnonzero(model.geom_group == COLLISION_GROUP).tolist():
+        body, link = int(model.geom_bodyid[geom]), 0
+        while body > 0 and link == 0:
+            link = carriers.index(body) + 1 if body in carriers else 0
+            body = int(model.body_parentid[body])
+        shapes[link].append(geom)
+    return shapes
+
+
+def _touch(
+    arm: ArmModel, model: mujoco.MjModel, data: mujoco.MjData, links: tuple[list[int], list[int]], between: slice
+) -> bool:
+    """Return whether two links touch in any of the postures that are tried."""
+    low, high = (
+        np.maximum(arm.lower[between], -np.pi),
+        np.minimum(arm.upper[between], np.pi),
+    )  # continuous joints have no limits
+    from scipy.stats import qmc  # noqa: PLC0415  takes half a second to import
+
+    addresses = [int(model.jnt_qposadr[model.joint(name).id]) for name in arm.joint_names[between]]
+    data.qpos[:] = arm.posture(model)
+    for fraction in qmc.Sobol(len(low), scramble=False).random(_POSTURES):
+        data.qpos[addresses] = low + fraction * (high - low)
+        mujoco.mj_kinematics(model, data)
+        for one in links[0]:
+            for other in links[1]:
+                if mujoco.mj_geomDistance(model, data, one, other, 0.01, None) <= 0.0:
+                    return True
+    return False

@@ -1,0 +1,122 @@
+"""Contact of the arm, detected from the torques of its joints."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.kinematics.arm import ArmModel, ArmState
+from imitarm.validation import finite_number, finite_vector, instance
+
+Array = NDArray[np.float64]
+
+_DRY_FRICTION_SPEED = 0.02  # [rad/s] below it the direction of the dry friction is uncertain
+_SHARE = 0.1  # of the rated torque
+_UNRATED = 10.0  # [N m] for a joint without a rated torque
+_GAP = 0.1  # [s] after a longer gap between two states the observer starts again
+
+
+class Contact(NamedTuple):
+    """A contact that the torques of the joints show.
+
+    Attributes:
+        joint: name of the joint with the largest unexplained torque, in units of its threshold.
+        torque: external torque on this joint [N m].
+        threshold: largest torque that does not count as a contact [N m].
+        time: time on the robot's clock [s].
+    """
+
+    joint: str
+    torque: float
+    threshold: float
+    time: float
+
+    def __str__(self) -> str:
+        return (
+            f"contact: an external torque of {self.torque:.1f} N m acts on {self.joint} "
+            f"({self.threshold:.1f} N m are allowed)"
+        )
+
+
+class ContactDetector:
+    r"""Detects contacts by the momentum observer, which estimates the external torques on the joints.
+
+    The generalised momentum :math:`p = M(q)\,\dot q` changes by the torques of the drives :math:`\tau`, of gravity and
+    Coriolis forces, of friction :math:`\tau_f`, and by external torques :math:`\tau_e = J^T F`. The observer (De Luca,
+    Albu-Schaeffer, Haddadin and Hirzinger, "Collision detection and safe reaction with the DLR-III lightweight
+    manipulator arm", IROS 2006) compares the momentum with the integral of all torques but the external ones:
+
+    .. math:: r = K \Big( p - \int (\tau - \tau_f + C^T \dot q - g + r)\, dt \Big), \qquad \dot r = K (\tau_e - r) .
+
+    The residual r therefore follows the external torque like a low-pass filter with the time constant 1/K, and no
+    acceleration has to be measured. Between two states at :math:`t_{k-1}` and :math:`t_k`, the change of the momentum
+    and the Coriolis and gravity terms are evaluated in the middle, where they add up to the inverse dynamics of the
+    mean acceleration. The thesis mentions torque sensors that "help the robot detect collision" (3.2.3), and says no
+    more about them.
+
+    While a joint stands still, its dry friction can compensate an external torque, so the residual is uncertain by the
+    dry friction.
+
+    Args:
+        arm: the arm with its tool, as the observer knows it. Masses are needed.
+        threshold: external torque of each joint that counts as a contact, one number or shape (n_joints,) [N m]; None:
+            a tenth of the rated torque plus the dry friction of the joint.
+        gain: K [1/s].
+
+    Attributes:
+        threshold: as above, shape (n_joints,) [N m].
+        residual: the estimated external torques r, shape (n_joints,) [N m].
+
+    Raises:
+        InputError: when a number can't be used, or a link of the arm has no usable mass.
+    """
+
+    def __init__(self, arm: ArmModel, *, threshold: ArrayLike | None = None, gain: float = 25.0) -> None:
+        self.arm = instance(arm, ArmModel, "ContactDetector: arm")
+        arm.check_dynamics()
+        self.gain = finite_number(gain, "ContactDetector: gain", "1/s", above=0.0)
+        model = arm.spec().compile()
+        dofs = [int(model.jnt_dofadr[model.joint(name).id]) for name in arm.joint_names]
+        self._rotors, self._damping = np.array(model.dof_armature[dofs]), np.array(model.dof_damping[dofs])
+        self._dry = np.array(model.dof_frictionloss[dofs])
+        if threshold is None:
+            self.threshold = _SHARE * np.where(np.isfinite(arm.max_torque), arm.max_torque, _UNRATED / _SHARE)
+            self.threshold += self._dry
+        else:
+            given = np.broadcast_to(np.asarray(threshold, dtype=float), (arm.n_joints,))
+            self.threshold = finite_vector(given, arm.n_joints, "ContactDetector: threshold", "N m").copy()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the motion so far."""
+        self._last: ArmState | None = None
+        self.residual: Array = np.zeros(self.arm.n_joints)
+
+    def update(self, state: ArmState) -> Contact | None:
+        """Take the next measured state, and return the contact that it shows.
+
+        Args:
+            state: positions, velocities and drive torques of the joints. Drives whose torques are not measured (NaN)
+                show no contact.
+
+        Returns:
+            None when no external torque exceeds its threshold.
+        """
+        last, self._last = self._last, state
+        dt = 0.0 if last is None else state.time - last.time
+        if last is None or not 0.0 < dt <= _GAP or not np.isfinite(state.torque).all():
+            return None
+        velocity, acceleration = 0.5 * (last.velocity + state.velocity), (state.velocity - last.velocity) / dt
+        explained = self.arm.inverse_dynamics(0.5 * (last.q + state.q), velocity, acceleration)
+        explained += self._rotors * acceleration + self._damping * velocity
+        explained += self._dry * np.tanh(velocity / _DRY_FRICTION_SPEED)
+        weight = -np.expm1(-self.gain * dt)  # the exact solution of the filter for a constant torque
+        self.residual = self.residual + weight * (explained - state.torque - self.residual)
+        ratio = np.abs(self.residual) / self.threshold
+        joint = int(ratio.argmax())
+        if ratio[joint] <= 1.0:
+            return None
+        torque, most = float(self.residual[joint]), float(self.threshold[joint])
+        return Contact(self.arm.joint_names[joint], torque, most, state.time)

@@ -1,0 +1,207 @@
+"""Inequalities for the inverse kinematics that keep an arm clear of obstacles."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.ik_problem import Rows
+from imitarm.scene.braking import APPROACH_RATE, LONGEST_YIELD, shrink_rates
+from imitarm.scene.distances import PackedObstacles, near_pairs
+from imitarm.scene.scene import Scene
+from imitarm.validation import finite_number, instance
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int_]
+
+_STEP = 0.05  # [m] steps in which the distance is extended within which obstacles have rows
+_UNMOVED = 1e-6  # [m/rad] a joint that changes a distance by less does not change it
+
+
+class NearRows(NamedTuple):
+    """The rows of :class:`ClearanceLimit`, and the pair of a sphere and an obstacle to which each belongs.
+
+    Attributes:
+        rows: inequalities on the joint velocity.
+        obstacle: index of the obstacle, shape (k,).
+        sphere: index of the sphere of the arm, shape (k,).
+        room: remaining distance h, shape (k,) [m].
+    """
+
+    rows: Rows
+    obstacle: Indices
+    sphere: Indices
+    room: Array
+
+
+class ClearanceLimit:
+    r"""Inequalities on the joint velocity that keep a clearance between every link (and the tool) and every obstacle.
+
+    Spheres cover the arm and its tool (``ArmModel.collision_spheres``). Let ``c`` and ``r`` be the centre and the
+    radius of a sphere near an obstacle with the signed distance ``sd`` and the outward normal ``n``. The remaining
+    distance is ``h = sd(c) - r - clearance``. Let ``v_o`` be the velocity of the obstacle's nearest point. The row for
+    this sphere is the following inequality on :math:`\dot q`:
+
+    .. math:: n^T J(q)\, \dot q \;\ge\; n^T v_o - k h, \qquad k = \min\Big(\xi,\; \frac1{T + t/2}\Big)
+
+    The row lets h shrink at most exponentially, and only so fast that the arm can still brake, or yield to the
+    obstacle, before h is used up: t is the time that the joints need for this, and T the delay of the commands
+    (:func:`~imitarm.scene.braking.shrink_rates`). For obstacles at rest, k is nearly always :math:`\xi`. Before a fast
+    obstacle, and for links that the joints accelerate only slowly, k is smaller, so the arm yields earlier. In theory h
+    stays positive. In practice h can become negative, because links move on arcs and control steps are finite. While h
+    is negative, ``retreat_rate`` replaces k, and h must grow.
+
+    Every sphere within ``influence`` of an obstacle has a row; none is left out, except rows that no velocity within
+    the limits of the joints can violate. The spheres contain the shapes they cover, so the true distance is never
+    smaller than the distance of the spheres.
+
+    Args:
+        arm: arm with its tool.
+        clearance: required distance of every link to every obstacle [m].
+        rate: ``xi``; while h is positive, it may shrink by at most this fraction of itself per second [1/s].
+        influence: value of h beyond which a sphere has no row [m]. It is extended by 0.75 s times the speed of the
+            fastest obstacle.
+        retreat_rate: while h is negative, it must grow by at least this fraction of its magnitude per second [1/s].
+        delay: T, the control period plus the latency of the arm [s]; the age of each obstacle is added.
+        deviations: number of standard deviations of each obstacle's position along the normal that are subtracted from
+            its distance, from the obstacle's covariance.
+
+    Raises:
+        InputError: when ``arm`` is not an ArmModel, or a number is not finite or is negative.
+    """
+
+    def __init__(
+        self,
+        arm: ArmModel,
+        clearance: float,
+        *,
+        rate: float = APPROACH_RATE,
+        influence: float = 0.15,
+        retreat_rate: float = 25.0,
+        delay: float = 0.01,
+        deviations: float = 0.0,
+    ) -> None:
+        self.arm = instance(arm, ArmModel, "ClearanceLimit: arm")
+        self.clearance = finite_number(clearance, "ClearanceLimit: clearance", "m", at_least=0.0)
+        self.rate = finite_number(rate, "ClearanceLimit: rate", "1/s", at_least=0.0)
+        self.retreat_rate = finite_number(retreat_rate, "ClearanceLimit: retreat_rate", "1/s", at_least=0.0)
+        self.influence = finite_number(influence, "ClearanceLimit: influence", "m", above=0.0)
+        self.delay = finite_number(delay, "ClearanceLimit: delay", "s", above=0.0)
+        self.deviations = finite_number(deviations, "ClearanceLimit: deviations", at_least=0.0)
+        cover = arm.cover
+        self._cover = cover
+        self._reduced = cover.radii + self.clearance  # [m] what is taken off a distance
+        self._reaches = {0: self._reduced + self.influence}  # by the speed of the fastest obstacle, in 0.1 m/s
+
+    def rows(self, q: ArrayLike, scene: Scene, velocity: ArrayLike | None = None) -> Rows | None:
+        """Return the inequalities for one posture.
+
+        Args:
+            q: joint positions, shape (n_joints,) [rad].
+            scene: obstacles predicted for the current time, with their velocities.
+            velocity: joint velocity, shape (n_joints,) [rad/s]; None: at rest.
+
+        Returns:
+            One row for each pair of a sphere and an obstacle within ``influence``; None when there is no pair. A pair
+            that is too close has no row if no joint can change its distance.
+
+        Raises:
+            InputError: when ``q`` is not n_joints finite numbers.
+        """
+        found = self.near(q, scene, velocity)
+        return None if found is None else found.rows
+
+    def near(
+        self, q: ArrayLike, scene: Scene, velocity: ArrayLike | None = None, margins: Array | None = None
+    ) -> NearRows | None:
+        """Return the inequalities and the pairs to which they belong; same arguments and errors as :meth:`rows`.
+
+        Args:
+            q: joint positions, shape (n_joints,) [rad].
+            scene: obstacles predicted for the current time, with their velocities.
+            velocity: joint velocity, shape (n_joints,) [rad/s]; None: at rest.
+            margins: distance added to the clearance of each obstacle, shape (n_obstacles,) [m]; None: nothing.
+        """
+        packed = scene.packed
+        if not len(packed):
+            return None
+        data = self.arm.at(q).data
+        centers = self._cover.centers(data)
+        pairs = near_pairs(packed, centers, self._reach(packed, margins))
+        if pairs is None:
+            return None
+        obstacle, sphere, distance, normal = pairs
+        points = centers.take(sphere, axis=0).T
+        matrix = self._cover.speeds(data, sphere, points, normal)
+        room = distance - self._reduced.take(sphere)
+        if margins is not None:
+            room -= margins.take(obstacle)
+        if self.deviations and packed.covariances.any():
+            spread = np.einsum("ik,kij,jk->k", normal, packed.covariances.take(obstacle, axis=0), normal)
+            room -= self.deviations * np.sqrt(np.maximum(spread, 0.0))
+        approach = _approach(packed, obstacle, points, normal)
+        lower = self._lower(scene, matrix, obstacle, room, approach, velocity)
+        return self._kept(matrix, lower, obstacle, sphere, room)
+
+    def _reach(self, packed: PackedObstacles, margins: Array | None) -> Array:
+        """Return the distance of each sphere's centre within which obstacles have rows; the same array if possible."""
+        if packed.still and margins is None and not self.deviations:
+            return self._reaches[0]
+        fastest = math.sqrt(float(np.einsum("ij,ij->i", packed.velocities, packed.velocities).max()))
+        more = 0.5 * LONGEST_YIELD * fastest + (0.0 if margins is None else max(float(margins.max()), 0.0))
+        if self.deviations:
+            more += self.deviations * math.sqrt(float(packed.covariances.trace(axis1=1, axis2=2).max()))
+        steps = math.ceil(more / _STEP)
+        if steps not in self._reaches:
+            self._reaches[steps] = self._reaches[0] + _STEP * steps
+        return self._reaches[steps]
+
+    def _lower(
+        self,
+        scene: Scene,
+        matrix: Array,
+        obstacle: Indices,
+        room: Array,
+        approach: Array | None,
+        velocity: ArrayLike | None,
+    ) -> Array:
+        """Return the lower bounds of the rows, shape (k,) [m/s]."""
+        speed = None if velocity is None else np.asarray(velocity, dtype=float)
+        packed = scene.packed
+        delay: Array | float = self.delay
+        if approach is not None:
+            delay += np.maximum(scene.stamp - packed.stamps, 0.0).take(obstacle)
+        rates = shrink_rates(self.arm, matrix, approach, speed, most=self.rate, delay=delay)
+        lower = -rates * room
+        lower -= (self.retreat_rate - rates) * np.minimum(room, 0.0)
+        if approach is not None:
+            lower += approach
+        return lower
+
+    def _kept(self, matrix: Array, lower: Array, obstacle: Indices, sphere: Indices, room: Array) -> NearRows | None:
+        """Leave out rows that no velocity can violate, and links that are too close and that no joint moves away."""
+        most = np.abs(matrix) @ self.arm.max_velocity
+        kept = lower > -most
+        if lower.max() > 0.0:  # a link that no joint moves away, such as one that turns in place above a table
+            kept &= (lower <= 0.0) | (np.einsum("ij,ij->i", matrix, matrix) > _UNMOVED**2)
+        if not kept.all():
+            if not kept.any():
+                return None
+            matrix, lower = matrix[kept], lower[kept]
+            obstacle, sphere, room = obstacle[kept], sphere[kept], room[kept]
+        return NearRows(Rows(matrix, lower), obstacle, sphere, room)
+
+
+def _approach(packed: PackedObstacles, obstacle: Indices, points: Array, normal: Array) -> Array | None:
+    """Return the speed of each obstacle's nearest point along the normal, shape (k,) [m/s]; None if none moves."""
+    if packed.still:
+        return None
+    velocity = packed.velocities.take(obstacle, axis=0).T
+    if packed.rotating:  # the nearest surface point p moves at v + w x (p - origin); c - p is along n
+        arms = points - packed.positions.take(obstacle, axis=0).T
+        velocity = velocity + np.cross(packed.angular_velocities.take(obstacle, axis=0).T, arms, axis=0)
+    return np.asarray(np.einsum("ij,ij->j", velocity, normal))
