@@ -15,7 +15,8 @@ from imitarm.kinematics.ik import IKSolver
 from imitarm.kinematics.limits import JointLimits, singularity_limits
 from imitarm.kinematics.tasks import ElbowTask, Task, TwistTask
 from imitarm.scene import Scene, Sphere
-from imitarm.scene.clearance import ClearanceLimit, SelfClearance
+from imitarm.scene.clearance import SelfClearance
+from imitarm.scene.clearance_limit import ClearanceLimit
 from timing import Row
 from yardsticks import DT, MinkStep, mink_step, named
 

@@ -15,8 +15,7 @@ from imitarm.kinematics.pose import rotate
 from imitarm.kinematics.sew import sew_angle
 from imitarm.retarget import FACING, Correspondence, LimbLengths, ModernRetargeter
 from imitarm.retarget.retargeter import ticks
-from imitarm.scene.clearance import SelfClearance
-from imitarm.scene.clearance import _shapes, meeting_links
+from imitarm.scene.clearance import SelfClearance, _shapes, meeting_links
 
 DT = 0.01
 ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}

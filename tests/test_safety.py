@@ -13,7 +13,8 @@ from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.limits import JointLimits
 from imitarm.safety import SafetyFilter
 from imitarm.scene import HalfSpace, Scene, Sphere
-from imitarm.scene.clearance import ClearanceLimit, SelfClearance
+from imitarm.scene.clearance import SelfClearance
+from imitarm.scene.clearance_limit import ClearanceLimit
 
 ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
 DT = 0.01

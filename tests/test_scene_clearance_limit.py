@@ -12,7 +12,7 @@ from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik import solve_ik
 from imitarm.kinematics.tasks import TwistTask
 from imitarm.scene import HalfSpace, Scene, Sphere
-from imitarm.scene.clearance import ClearanceLimit
+from imitarm.scene.clearance_limit import ClearanceLimit
 from scene_shapes import KINDS, random_obstacle
 
 

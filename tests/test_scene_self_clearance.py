@@ -12,8 +12,7 @@ from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik import solve_ik
 from imitarm.kinematics.tasks import PostureTask, TwistTask
-from imitarm.scene.clearance import SelfClearance
-from imitarm.scene.clearance import _shapes, meeting_links
+from imitarm.scene.clearance import SelfClearance, _shapes, meeting_links
 
 ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
 CLEARANCES = {name: SelfClearance(arm) for name, arm in ARMS.items()}

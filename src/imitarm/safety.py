@@ -18,7 +18,8 @@ from imitarm.kinematics.least_violation import least_violation
 from imitarm.kinematics.limits import Limit
 from imitarm.kinematics.tasks import ElbowTask, JointVelocityTask, PostureTask, Task, TwistTask
 from imitarm.perception.margins import CoverageMargin
-from imitarm.scene.clearance import ClearanceLimit, NearRows, SelfClearance
+from imitarm.scene.clearance import SelfClearance
+from imitarm.scene.clearance_limit import ClearanceLimit, NearRows
 from imitarm.scene.scene import Scene
 from imitarm.validation import finite_number, finite_vector, instance
 
@@ -78,9 +79,9 @@ class SafetyFilter:
     (:class:`~imitarm.kinematics.ik.IKSolver`):
 
     * The velocity always stays inside the position, velocity and acceleration limits of the joints.
-    * No part of the arm approaches an obstacle faster than :class:`~imitarm.scene.clearance.ClearanceLimit` allows, and
-      no link approaches another link faster than :class:`~imitarm.scene.clearance.SelfClearance` allows. An arm at rest
-      yields to an obstacle that moves towards it.
+    * No part of the arm approaches an obstacle faster than allowed by
+      :class:`~imitarm.scene.clearance_limit.ClearanceLimit`, and no link approaches another link faster than allowed by
+      :class:`~imitarm.scene.clearance.SelfClearance`. An arm at rest yields to an obstacle that moves towards it.
 
     If these inequalities :math:`A \dot q \ge b` contradict the joint limits, no safe motion exists, and ``safe`` is
     False. The command is then dropped, and the velocity is the one with the least squared violation of the

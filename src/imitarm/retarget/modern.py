@@ -23,7 +23,8 @@ from imitarm.retarget.correspondence import Correspondence
 from imitarm.retarget.engagement import EngagementRule
 from imitarm.retarget.retargeter import Goal, Retargeter
 from imitarm.scene import Scene
-from imitarm.scene.clearance import ClearanceLimit, SelfClearance
+from imitarm.scene.clearance import SelfClearance
+from imitarm.scene.clearance_limit import ClearanceLimit
 from imitarm.validation import finite_number, finite_numbers
 
 Array = NDArray[np.float64]

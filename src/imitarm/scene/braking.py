@@ -6,8 +6,8 @@ effect, and let the joints bring w evenly to zero. The remaining distance suffic
 
 .. math:: h \;\ge\; w\,T + \tfrac12 w\,t \qquad\Leftrightarrow\qquad w \;\le\; \frac{h}{T + t/2} .
 
-:func:`shrink_rates` returns the factor of h. It is used by the rows of the safety filter
-(:class:`~imitarm.scene.clearance.ClearanceLimit`) and by the execution times of planned paths, which therefore agree.
+:func:`shrink_rates` returns the factor of h. The rows of the safety filter
+(:class:`~imitarm.scene.clearance_limit.ClearanceLimit`) and the execution times of planned paths use it, so they agree.
 """
 
 from __future__ import annotations
