@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.benchmark.refusal_oracle import Answer, decide
-from imitarm.benchmark.refusal_proof import Question
+from imitarm.benchmark.refusal_question import Question
 from imitarm.errors import InfeasibleError
 from imitarm.kinematics.arm import ArmState
 from imitarm.kinematics.pose import Pose

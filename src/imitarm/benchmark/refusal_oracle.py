@@ -1,18 +1,16 @@
 """An oracle that checks refusals of ``adapt``: it decides whether a path around the obstacles exists.
 
-The oracle shares no code with the library's search for a path. The oracle considers many times along the nominal
-path, called layers. In each layer, the possible displacements of the path are the cells of a grid.
+The oracle shares no code with the library's search for a path. The oracle gives one of three answers:
 
-The oracle gives one of three answers:
-
-* **impossible**: a proof. Either an obstacle covers a point that must not move. Or no chain of free boxes leads from
-  the start to the goal: positions are grouped into boxes, and times into intervals, and a box counts as free if any of
-  its points may be free at any time of an interval. Then no continuous displacement of the path exists.
-* **possible**: a path was found and verified. A cell counts as free if its centre is free. Tangents give a lower bound
-  of the distance to the obstacles during moves between neighbouring cells and between layers. Dynamic
-  programming finds the chain of free cells with the smallest displacements. A sum of the skill's components is then
-  fitted to this chain. If the components are too wide for the fit, hat functions in time replace them.
-* **undecided**: even the finest grid gave neither a proof nor a path.
+* **impossible**: a proof. Either an obstacle covers a point that must not move. Or no chain of boxes of positions and
+  times leads from the start to the goal, see :mod:`imitarm.benchmark.refusal_proof`. Then no continuous displacement of
+  the path exists.
+* **possible**: a path was found and verified. A chain of free boxes leads from the start to the goal, or a chain of
+  free cells in a grid of displacements at many times, called layers. In the grid, a cell counts as free if its centre
+  is free. Tangents give a lower bound of the distance to the obstacles during moves between neighbouring cells and
+  between layers. Dynamic programming finds the chain with the smallest displacements. A sum of the skill's components
+  is then fitted to the chain. If the components are too wide for the fit, hat functions in time replace them.
+* **undecided**: even the finest grid and the smallest boxes gave neither a proof nor a path.
 
 The oracle uses the same limits as the library. No sample is displaced by more than 0.5 m. No step is longer than 8
 times the longest step of the nominal path. At fixed times, the path is not displaced. No displacement has a component
@@ -21,8 +19,7 @@ in a forbidden direction.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator
 from enum import Enum
 from typing import Any
 
@@ -30,20 +27,18 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.benchmark.refusal_proof import (
+from imitarm.benchmark.refusal_proof import explored
+from imitarm.benchmark.refusal_question import (
     MAX_DISPLACEMENT,
+    MAX_STEP_RATIO,
     Question,
     covers_fixed_point,
-    grids,
-    halves,
-    is_impossible,
     separation,
 )
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-MAX_STEP_RATIO = 8.0  # as the product states it
 _SEARCH_GRIDS = {
     1: ((0.5, 0.002),),
     2: ((0.2, 0.01), (0.5, 0.01), (0.5, 0.004), (0.3, 0.002), (0.12, 0.001)),
@@ -74,52 +69,52 @@ def decide(question: Question) -> tuple[Answer, Array | None]:
 
     The path has the times of ``question.nominal``.
     """
-    axes = question.axes()
-    if not len(axes):  # nothing may move
-        only = solution(question, axes)
-        return (Answer.IMPOSSIBLE if only is None else Answer.POSSIBLE), only
-    # What is impossible for a part of the tool is impossible for all of it; the part next to the tip is the quickest.
-    nearest = int(np.argmin(np.linalg.norm(question.spheres[:, :3], axis=1)))
-    part = replace(question, spheres=question.spheres[[nearest]])
-    boxes, searches = grids(part, axes), _SEARCH_GRIDS[len(axes)]
-    if covers_fixed_point(question) or is_impossible(part, next(boxes)):
+    if covers_fixed_point(question):
         return Answer.IMPOSSIBLE, None
-    if (found := solution(question, axes, searches[:1])) is not None:
-        return Answer.POSSIBLE, found
-    if any(is_impossible(part, cells) for cells in boxes):
-        return Answer.IMPOSSIBLE, None
-    if (found := solution(question, axes, searches[1:])) is not None:
-        return Answer.POSSIBLE, found
-    whole = grids(question, axes) if len(question.spheres) > 1 else ()
-    impossible = any(is_impossible(question, cells) for cells in whole)
-    return (Answer.IMPOSSIBLE if impossible else Answer.UNDECIDED), None
+    return _searched(question)
 
 
 def is_solved(question: Question) -> bool:
     """Return whether a path is found and verified."""
-    return solution(question) is not None
+    return _searched(question)[0] is Answer.POSSIBLE
 
 
-def solution(
-    question: Question, axes: Array | None = None, grids_to_search: Sequence[tuple[float, float]] | None = None
-) -> Array | None:
-    """Return the positions (n, 3) [m] of a path that was found and verified; None if no path is found.
-
-    Args:
-        question: the scene and the path.
-        axes: orthonormal basis of the permitted displacements, shape (d, 3); None: ``question.axes()``.
-        grids_to_search: reach and cell size [m] of each grid to search; None: all grids.
-    """
-    axes = question.axes() if axes is None else axes
+def _searched(question: Question) -> tuple[Answer, Array | None]:
+    """Search for a proof or a path: in cells without and with division in time, and on coarse and finer grids."""
     if separation(question, question.nominal.times, question.nominal.positions) >= -1e-9:
-        return question.nominal.positions
-    if not len(axes):
-        return None
-    for reach, h in _SEARCH_GRIDS[len(axes)] if grids_to_search is None else grids_to_search:
-        chain = _chain(question, axes, reach, h)
-        if chain is not None and (found := _fits(question, axes, chain)) is not None:
-            return found
-    return None
+        return Answer.POSSIBLE, question.nominal.positions
+    axes = question.axes()
+    if not len(axes):  # nothing may move
+        return Answer.IMPOSSIBLE, None
+    coarse, *finer = _SEARCH_GRIDS[len(axes)]
+    found: Array | None = None
+    for timed in (False, True):
+        seen = explored(question, timed=timed)
+        if seen.impossible:
+            return Answer.IMPOSSIBLE, None
+        if seen.way is not None:
+            found = _fits(question, axes, _along(question, *seen.way))
+        if found is None and not timed:
+            found = _on_grid(question, axes, *coarse)
+        if found is not None:
+            return Answer.POSSIBLE, found
+    for reach, h in finer:
+        if (found := _on_grid(question, axes, reach, h)) is not None:
+            return Answer.POSSIBLE, found
+    return Answer.UNDECIDED, None
+
+
+def _on_grid(question: Question, axes: Array, reach: float, h: float) -> Array | None:
+    """Return the positions (n, 3) [m] of a path that was found on one grid and verified; None if none is found."""
+    chain = _chain(question, axes, reach, h)
+    return None if chain is None else _fits(question, axes, chain)
+
+
+def _along(question: Question, times: Array, positions: Array) -> tuple[Array, Array]:
+    """Return the times (n,) and displacements (n, 3) of the samples on a polyline: ``positions`` at ``times``."""
+    at = question.nominal.times
+    moved = np.stack([np.interp(at, times, column) for column in positions.T], axis=1)
+    return at, moved - question.nominal.positions
 
 
 def _chain(question: Question, axes: Array, reach: float, h: float) -> tuple[Array, Array] | None:
@@ -254,7 +249,7 @@ def _layer(
             free &= (distance >= need).reshape(shape)
             value, slopes = distance.reshape(shape), gradient.reshape((*shape, 3))
             for axis in range(d):
-                first, last = halves(axis, d)
+                first, last = _neighbours_along(axis, d)
                 sides[axis][first] &= _keeps(
                     need, value[first], value[last], slopes[first], slopes[last], h * axes[axis]
                 )
@@ -309,7 +304,7 @@ def _swept(cost: Array, sides: list[Bools], usable: Bools, h: float) -> Array:
     d = cost.ndim
     result = cost.copy()
     for axis in range(d):
-        first, last = halves(axis, d)
+        first, last = _neighbours_along(axis, d)
         passable = sides[axis][first]
         up = np.where(passable, cost[first], np.inf) + _CHANGE_COST * h
         down = np.where(passable, cost[last], np.inf) + _CHANGE_COST * h
@@ -472,3 +467,13 @@ def _close_points(question: Question, times: Array, tip: Array, relative: Array,
             for segment in np.flatnonzero(gap.min(axis=0) < 2e-6).tolist():
                 found.append((segment, float(fractions[int(np.argmin(gap[:, segment])), 0, 0])))
     return np.array(found).reshape(-1, 2)
+
+
+def _neighbours_along(axis: int, d: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    """Return two indices of a d-dimensional array.
+
+    Along ``axis``, the first index omits the last entry, and the second index omits the first entry.
+    """
+    first, last = [slice(None)] * d, [slice(None)] * d
+    first[axis], last[axis] = slice(None, -1), slice(1, None)
+    return tuple(first), tuple(last)

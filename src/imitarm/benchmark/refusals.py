@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from imitarm.benchmark.avoidance import learn
 from imitarm.benchmark.refusal_oracle import Answer, answer, is_solved
-from imitarm.benchmark.refusal_proof import Question, separation
+from imitarm.benchmark.refusal_question import Question, separation
 from imitarm.benchmark.static_scenes import StaticCase
 from imitarm.benchmark.tables import Table
 from imitarm.demonstrations import align, read

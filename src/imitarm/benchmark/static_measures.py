@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
-from imitarm.benchmark.refusal_proof import Question, separation
+from imitarm.benchmark.refusal_question import Question, separation
 from imitarm.benchmark.static_scenes import StaticCase
 from imitarm.evaluation.motion import log_dimensionless_jerk, spectral_arc_length
 from imitarm.kinematics.pose import rotate
