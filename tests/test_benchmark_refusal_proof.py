@@ -7,11 +7,17 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from imitarm.benchmark.refusal_cells import TIME_LEVELS, Cells, Leg, classified
-from imitarm.benchmark.refusal_oracle import Answer, decide
-from imitarm.benchmark.refusal_proof import explored
-from imitarm.benchmark.refusal_question import MAX_DISPLACEMENT, MAX_STEP_RATIO, Question, separation
-from imitarm.benchmark.refusal_ways import beside, even, short
+from imitarm.benchmark.refusal_oracle import decide
+from imitarm.benchmark.refusal_proof import Answer, Cells, classified, explored
+from imitarm.benchmark.refusal_question import (
+    MAX_DISPLACEMENT,
+    MAX_STEP_RATIO,
+    TIME_LEVELS,
+    Leg,
+    Question,
+    separation,
+)
+from imitarm.benchmark.refusal_routes import beside, even, short
 from imitarm.benchmark.refusals import question_of, scene_for, skills_to_adapt
 from imitarm.kinematics.pose import Pose, quaternion_exp
 from imitarm.policies import HORIZONTAL_ONLY
@@ -113,7 +119,7 @@ def test_a_gap_that_is_too_narrow_is_proved_while_the_path_rises(skills, lacking
     walls, _ = wall(skills[0], 0.03 - lacking)
     asked = question(skills[0], walls, forbidden=HORIZONTAL_ONLY)
     assert np.ptp(asked.nominal.positions[:, 2]) > 0.02
-    assert explored(asked, timed=False).impossible
+    assert explored(asked, timed=False).answer is Answer.IMPOSSIBLE
 
 
 def test_a_gap_with_a_millimetre_to_spare_is_passed(skills):
@@ -154,13 +160,13 @@ def test_a_way_is_short_and_followed_within_the_limits():
     rng = np.random.default_rng(3)
     low = rng.random((12, 2)) * 0.2
     high = low + 0.1
-    way = short(np.zeros(2), np.ones(2), low, high)
-    assert np.all((way[1:-1] >= low) & (way[1:-1] <= high))
+    route = short(np.zeros(2), np.ones(2), low, high)
+    assert np.all((route[1:-1] >= low) & (route[1:-1] <= high))
     others = rng.uniform(low, high, (200, 12, 2))
-    steps = [np.sum(np.diff(np.concatenate([way[:1], p, way[-1:]]), axis=0) ** 2) for p in (way[1:-1], *others)]
+    steps = [np.sum(np.diff(np.concatenate([route[:1], p, route[-1:]]), axis=0) ** 2) for p in (route[1:-1], *others)]
     assert min(steps) == steps[0]
     earliest = np.sort(rng.random(12) * 0.5)
-    times = even(way, earliest, earliest + 0.3)
+    times = even(route, earliest, earliest + 0.3)
     assert times[0] == 0.0 and times[-1] == 1.0 and np.all(np.diff(times) >= 0.0)
     assert np.all((times[1:-1] >= earliest - 1e-9) & (times[1:-1] <= earliest + 0.3 + 1e-9))
 
@@ -168,11 +174,11 @@ def test_a_way_is_short_and_followed_within_the_limits():
 def test_a_path_beside_the_nominal_one_is_never_too_fast():
     samples = np.linspace(0.0, 1.0, 100)
     nominal = np.stack([samples, 0.0 * samples], axis=1)
-    way = np.array([[0.0, 0.0], [0.2, 0.3], [0.9, 0.3], [1.0, 0.0]])
-    times, points = beside(way, samples, nominal)
+    route = np.array([[0.0, 0.0], [0.2, 0.3], [0.9, 0.3], [1.0, 0.0]])
+    times, points = beside(route, samples, nominal)
     assert np.array_equal(times, samples)
-    np.testing.assert_allclose(points[[0, -1]], way[[0, -1]], atol=1e-12)
+    np.testing.assert_allclose(points[[0, -1]], route[[0, -1]], atol=1e-12)
     assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() <= MAX_STEP_RATIO * (nominal[1, 0] - nominal[0, 0])
-    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1)))
-    steady = np.stack([np.interp(samples * length[-1], length, column) for column in way.T], axis=1)
+    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(route, axis=0), axis=1)))
+    steady = np.stack([np.interp(samples * length[-1], length, column) for column in route.T], axis=1)
     assert np.sum((points - nominal) ** 2) < np.sum((steady - nominal) ** 2)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from imitarm.benchmark.refusal_oracle import Answer, answer
+from imitarm.benchmark.refusal_oracle import answer
+from imitarm.benchmark.refusal_proof import Answer
 from imitarm.benchmark.refusals import adapted, question_of
 from imitarm.benchmark.static_scenes import ANY_SKILL, FAMILIES, SPLITS, learned_skill, static_case
 from imitarm.demonstrations import align

@@ -15,7 +15,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.benchmark.refusal_oracle import Answer, decide
+from imitarm.benchmark.refusal_oracle import decide
+from imitarm.benchmark.refusal_proof import Answer
 from imitarm.benchmark.refusal_question import Question
 from imitarm.errors import InfeasibleError
 from imitarm.kinematics.arm import ArmState

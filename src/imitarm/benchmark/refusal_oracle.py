@@ -20,14 +20,13 @@ in a forbidden direction.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from enum import Enum
 from typing import Any
 
 import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.benchmark.refusal_proof import explored
+from imitarm.benchmark.refusal_proof import Answer, explored
 from imitarm.benchmark.refusal_question import (
     MAX_DISPLACEMENT,
     MAX_STEP_RATIO,
@@ -35,6 +34,7 @@ from imitarm.benchmark.refusal_question import (
     covers_fixed_point,
     separation,
 )
+from imitarm.benchmark.refusal_routes import at_samples
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -49,14 +49,6 @@ _LATERAL_SWEEPS = 16  # cells that a chain may move sideways within a layer
 _CHANGE_COST = 20.0  # [1/m]
 _AWAY_COST = 2.0  # [1/m^2] at each layer
 _FIT_ROUNDS = 12
-
-
-class Answer(Enum):
-    """Answer of the oracle."""
-
-    IMPOSSIBLE = "impossible"
-    POSSIBLE = "possible"
-    UNDECIDED = "undecided"
 
 
 def answer(question: Question) -> Answer:
@@ -90,10 +82,10 @@ def _searched(question: Question) -> tuple[Answer, Array | None]:
     found: Array | None = None
     for timed in (False, True):
         seen = explored(question, timed=timed)
-        if seen.impossible:
+        if seen.answer is Answer.IMPOSSIBLE:
             return Answer.IMPOSSIBLE, None
-        if seen.way is not None:
-            found = _fits(question, axes, _along(question, *seen.way))
+        if seen.route is not None:
+            found = _fits(question, axes, at_samples(question.nominal, *seen.route))
         if found is None and not timed:
             found = _on_grid(question, axes, *coarse)
         if found is not None:
@@ -108,13 +100,6 @@ def _on_grid(question: Question, axes: Array, reach: float, h: float) -> Array |
     """Return the positions (n, 3) [m] of a path that was found on one grid and verified; None if none is found."""
     chain = _chain(question, axes, reach, h)
     return None if chain is None else _fits(question, axes, chain)
-
-
-def _along(question: Question, times: Array, positions: Array) -> tuple[Array, Array]:
-    """Return the times (n,) and displacements (n, 3) of the samples on a polyline: ``positions`` at ``times``."""
-    at = question.nominal.times
-    moved = np.stack([np.interp(at, times, column) for column in positions.T], axis=1)
-    return at, moved - question.nominal.positions
 
 
 def _chain(question: Question, axes: Array, reach: float, h: float) -> tuple[Array, Array] | None:

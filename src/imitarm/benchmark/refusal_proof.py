@@ -1,16 +1,23 @@
 """Proof that no path exists: a graph of cells, divided only where a path may still lead.
 
+A *cell* is a box of positions of the tip and an interval of time. A cell is blocked only if this is certain for every
+position in the box at every time in the interval: then one inflated obstacle contains the tool's sphere throughout, or
+every position is displaced too far or in a forbidden direction. The inflated obstacle is convex. It therefore contains
+everything between points that it contains, and a few points suffice: the corners of the box that contains the sphere's
+centre at all times. A cell is free if, just as certainly, nothing can block any part of it.
+
 Two cells are neighbours if they have a position and a time in common. A path leads from cell to neighbouring cell, and
-never back in time. If the graph of all cells that are not blocked contains no way from the start to the goal, then no
-continuous displacement of the path keeps the path clear of the obstacles. Each round finds the ways that cross the
-fewest cells of which it is not known whether they are free, and divides these cells. Cells to which no way leads are
-left out. A way of free cells only ends the search, because then a path exists, except for the limit of its speed.
+never back in time. If the graph of all cells that are not blocked contains no route from the start to the goal, then no
+continuous displacement of the path keeps the path clear of the obstacles. Each round finds the routes that cross the
+fewest cells of which it is not known whether they are free, and divides these cells. Cells to which no route leads are
+left out. A route of free cells only ends the search, because then a path exists, except for the limit of its speed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from enum import Enum
 from itertools import pairwise
 from typing import Any
 
@@ -19,19 +26,29 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import dijkstra
 
-from imitarm.benchmark.refusal_cells import Cells, Leg, classified
-from imitarm.benchmark.refusal_question import Question
-from imitarm.benchmark.refusal_ways import beside, even, short
+from imitarm.benchmark.refusal_question import MAX_DISPLACEMENT, TIME_LEVELS, Leg, Question
+from imitarm.benchmark.refusal_routes import beside, even, short
 from imitarm.scene.obstacle import PosedObstacle
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Index = NDArray[np.intp]
 
+_TOUCH = 1e-12  # [m] cells that are less apart touch
+_ROUNDING = 1e-9  # [m]
+_STILL = 1e-12  # [m] a box that is smaller along an axis is flat
 _MAX_CELLS = 60_000, 300_000  # without and with division in time
 _FREE_COST = 1e-3  # of a free cell; any other cell costs 1
-_WIDER = 1.25, 1.5  # ways that cost up to this factor more, plus this number of cells, are refined with the cheapest
+_WIDER = 1.25, 1.5  # routes that cost up to this factor more, plus this number of cells, are refined with the cheapest
 _MAX_FRAMES = 3
+
+
+class Answer(Enum):
+    """Answer to the question whether a path exists."""
+
+    IMPOSSIBLE = "impossible"
+    POSSIBLE = "possible"
+    UNDECIDED = "undecided"
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,33 +56,35 @@ class Exploration:
     """What is known of one question.
 
     Attributes:
-        impossible: whether it is proved that no path exists.
-        way: times (m,) [s] and positions (m, 3) [m] of a path through free cells; None if no such path was found. Only
-            the speed along this path may be too high.
+        answer: whether a route of free cells was found, or it is proved that no path exists.
+        route: times (m,) [s] and positions (m, 3) [m] of a path through free cells; None if no such path was found.
+            Only the speed along this path may be too high.
     """
 
-    impossible: bool
-    way: tuple[Array, Array] | None = None
+    answer: Answer
+    route: tuple[Array, Array] | None = None
 
 
 def explored(question: Question, *, timed: bool) -> Exploration:
-    """Prove that no path exists, or find a way through free cells.
+    """Prove that no path exists, or find a route through free cells.
 
     Args:
         question: scene and path; at least one direction of displacement is permitted.
         timed: whether cells are also divided in time. If False, all cells have the whole duration of a leg. This takes
             little time, and suffices for most scenes in which nothing but the tip moves.
     """
-    found = Exploration(False)
+    found = Exploration(Answer.UNDECIDED)
     for frame in _frames(question, question.axes()):
         legs = [Leg(question, frame, start, end) for start, end in pairwise(question.fixed_times)]
         parts = [_explored(leg, timed=timed) for leg in legs]
-        if any(part.impossible for part in parts):
-            return Exploration(True)
-        ways = [part.way for part in parts if part.way is not None]
-        if len(ways) == len(legs):
-            found = Exploration(False, (np.concatenate([w[0] for w in ways]), np.concatenate([w[1] for w in ways])))
-        if timed or found.way is not None:
+        if any(part.answer is Answer.IMPOSSIBLE for part in parts):
+            return Exploration(Answer.IMPOSSIBLE)
+        routes = [part.route for part in parts if part.route is not None]
+        if len(routes) == len(legs):
+            found = Exploration(
+                Answer.POSSIBLE, (np.concatenate([w[0] for w in routes]), np.concatenate([w[1] for w in routes]))
+            )
+        if timed or found.route is not None:
             break
     return found
 
@@ -93,25 +112,39 @@ def _aligned(rotation: Array, axes: Array) -> Array:
 
 
 def _explored(leg: Leg, *, timed: bool) -> Exploration:
-    """Divide cells until no way is left, or a way of free cells is found, or there are too many cells."""
-    cells, blocked = leg.root(timed=timed)
+    """Divide cells until no route is left, or a route of free cells is found, or there are too many cells."""
+    cells, blocked = _root(leg, timed=timed)
     if blocked.any():
-        return Exploration(True)
+        return Exploration(Answer.IMPOSSIBLE)
     edges = np.empty((2, 0), dtype=np.intp)
     made = 1
     while made < _MAX_CELLS[timed]:
         graph = _Graph(leg, cells, edges)
         if not graph.alive.any():
-            return Exploration(True)
+            return Exploration(Answer.IMPOSSIBLE)
         if graph.is_free:
-            return Exploration(False, graph.way(timed=timed))
+            return Exploration(Answer.POSSIBLE, graph.route(timed=timed))
         made += 2 * int(graph.wanted.sum())
         cells, edges = _refined(leg, cells, edges, graph, timed=timed)
-    return Exploration(False)
+    return Exploration(Answer.UNDECIDED)
+
+
+def _root(leg: Leg, *, timed: bool) -> tuple[Cells, Bools]:
+    """Return one cell with all permitted positions and times, and whether it is blocked, shape (1,).
+
+    Args:
+        leg: the leg.
+        timed: see :func:`classified`.
+    """
+    whole = np.zeros(1, dtype=np.intp)
+    low, high = leg.tip_box(whole, whole)
+    # Not symmetric about the path: otherwise, many scenes have an obstacle exactly at the border of two cells.
+    low, high = low - 1.02 * MAX_DISPLACEMENT, high + 1.01 * MAX_DISPLACEMENT
+    return classified(leg, Cells.unknown(low, high, whole, whole, whole), timed=timed)
 
 
 def _refined(leg: Leg, cells: Cells, edges: Index, graph: _Graph, *, timed: bool) -> tuple[Cells, Index]:
-    """Divide the wanted cells, and leave out those that are blocked or that no way leads through."""
+    """Divide the wanted cells, and leave out those that are blocked or that no route leads through."""
     kept, split = np.flatnonzero(graph.alive & ~graph.wanted), np.flatnonzero(graph.wanted)
     pieces, blocked = classified(leg, cells.take(split).halves(), timed=timed)
     stays = np.flatnonzero(~blocked)
@@ -129,7 +162,7 @@ def _refined(leg: Leg, cells: Cells, edges: Index, graph: _Graph, *, timed: bool
 
 
 class _Graph:
-    """The cheapest ways from the start to the goal through cells.
+    """The cheapest routes from the start to the goal through cells.
 
     Args:
         leg: the leg.
@@ -137,9 +170,9 @@ class _Graph:
         edges: pairs of neighbouring cells, shape (2, m).
 
     Attributes:
-        alive: whether a way leads through the cell, shape (n,).
+        alive: whether a route leads through the cell, shape (n,).
         wanted: whether the cell is to be divided, shape (n,).
-        is_free: whether a way leads through free cells only.
+        is_free: whether a route leads through free cells only.
     """
 
     def __init__(self, leg: Leg, cells: Cells, edges: Index) -> None:
@@ -150,8 +183,8 @@ class _Graph:
         source, target = np.concatenate([edges, edges[::-1]], axis=1)
         onward = end[target] > start[source]
         source, target = source[onward], target[onward]
-        self._ways = _directed(source, target, first, cost)
-        there = dijkstra(self._ways, indices=n)[:n]
+        self._routes = _directed(source, target, first, cost)
+        there = dijkstra(self._routes, indices=n)[:n]
         home = dijkstra(_directed(target, source, last, cost), indices=n)[:n]
         through = there + home - cost
         self.alive = np.isfinite(through)
@@ -160,10 +193,10 @@ class _Graph:
         self.is_free = cheapest < 1.0
         self._end = int(last[np.argmin(there[last])]) if self.is_free else -1
 
-    def way(self, *, timed: bool) -> tuple[Array, Array]:
-        """Return times (m,) [s] and positions (m, 3) [m] of a path along the cheapest way, whose cells are all free."""
+    def route(self, *, timed: bool) -> tuple[Array, Array]:
+        """Return times (m,) [s] and positions (m, 3) [m] of a path along the cheapest route, which is free."""
         n, leg = len(self._cells), self._leg
-        before = dijkstra(self._ways, indices=n, return_predecessors=True)[1]
+        before = dijkstra(self._routes, indices=n, return_predecessors=True)[1]
         route = [self._end]
         while before[route[-1]] != n:
             route.append(int(before[route[-1]]))
@@ -187,3 +220,216 @@ def _directed(source: Index, target: Index, first: Index, cost: Array) -> Any:
     n = len(cost)
     rows, columns = np.append(source, np.full(len(first), n)), np.append(target, first)
     return sparse.csr_matrix((cost[columns], (rows, columns)), shape=(n + 1, n + 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Boxes of positions, each with an interval of time.
+
+    Attributes:
+        low: lowest coordinates, shape (n, d) [m].
+        high: highest coordinates, shape (n, d) [m].
+        level: level of the interval, which is the 2^level-th part of the leg, shape (n,).
+        at: number of the interval on its level, shape (n,).
+        depth: number of divisions from which the cell results, shape (n,).
+        free: whether the cell is certainly free, shape (n,).
+        axis: axis along which the cell is divided next; d stands for time, shape (n,).
+    """
+
+    low: Array
+    high: Array
+    level: Index
+    at: Index
+    depth: Index
+    free: Bools
+    axis: Index
+
+    @classmethod
+    def unknown(cls, low: Array, high: Array, level: Index, at: Index, depth: Index) -> Cells:
+        """Return cells of which nothing is known yet."""
+        n = len(level)
+        return cls(low, high, level, at, depth, np.zeros(n, dtype=bool), np.zeros(n, dtype=np.intp))
+
+    def __len__(self) -> int:
+        return len(self.level)
+
+    def take(self, chosen: Index) -> Cells:
+        """Return some of the cells."""
+        return Cells(**{name: values[chosen] for name, values in vars(self).items()})
+
+    def __add__(self, other: Cells) -> Cells:
+        return Cells(**{name: np.concatenate([values, getattr(other, name)]) for name, values in vars(self).items()})
+
+    def times(self) -> tuple[Array, Array]:
+        """Return start and end of each interval, as fractions of the leg, each of shape (n,)."""
+        length = 0.5**self.level
+        return self.at * length, (self.at + 1) * length
+
+    def touch(self, i: Index, j: Index) -> Bools:
+        """Return for pairs (m,) of cells whether they have a position and a time in common."""
+        start, end = self.times()
+        answer = (start[i] <= end[j]) & (start[j] <= end[i])
+        for low, high in zip(self.low.T, self.high.T, strict=True):
+            answer &= (low[i] <= high[j] + _TOUCH) & (low[j] <= high[i] + _TOUCH)
+        return np.asarray(answer)
+
+    def contain(self, position: Array, time: float) -> Index:
+        """Return the cells that contain a position (d,) [m] at a time, a fraction of the leg."""
+        start, end = self.times()
+        inside = np.all((self.low - _TOUCH <= position) & (position <= self.high + _TOUCH), axis=1)
+        return np.flatnonzero(inside & (start <= time) & (time <= end))
+
+    def halves(self) -> Cells:
+        """Return the 2 n halves of the cells: first all lower or earlier halves, then all others."""
+        d, rows = self.low.shape[1], np.arange(len(self))
+        low, high = np.concatenate([self.low, self.low]), np.concatenate([self.high, self.high])
+        level, at = np.tile(self.level, 2), np.tile(self.at, 2)
+        later = np.flatnonzero(self.axis == d)
+        for half in (0, 1):
+            level[later + half * len(self)] += 1
+            at[later + half * len(self)] = 2 * self.at[later] + half
+        i = np.flatnonzero(self.axis < d)
+        middle = 0.5 * (self.low[rows[i], self.axis[i]] + self.high[rows[i], self.axis[i]])
+        high[i, self.axis[i]] = middle
+        low[i + len(self), self.axis[i]] = middle
+        return Cells.unknown(low, high, level, at, np.tile(self.depth + 1, 2))
+
+
+class _Choice:
+    """Choice of the axis along which each of n cells is divided next.
+
+    Each obstacle or limit that may block a part of a cell has a *span*: how much its distance varies over the cell
+    along each axis. A cell is divided along the longest span of one obstacle or limit. Three choices of the latter take
+    turns, because each alone would divide some cells for ever without a result:
+
+    * the one that needs the least additional depth to block the whole cell;
+    * the one with the longest span in space;
+    * the one that blocks the largest fraction of the cell.
+    """
+
+    def __init__(self, n: int) -> None:
+        self._best = np.full((3, n), -np.inf)
+        self._axes = np.zeros((3, n), dtype=np.intp)
+
+    def add(self, cells: Index, value: Array, spans: Array) -> None:
+        """Add an obstacle or limit.
+
+        Args:
+            cells: the cells of which it may block a part, shape (m,).
+            value: distance to it at the centre of each cell, shape (m,) [m]; negative if the centre is blocked.
+            spans: see above, along the d axes and time, shape (m, d + 1) [m].
+        """
+        if not len(cells):
+            return
+        total, longest = spans.sum(axis=1), spans.argmax(axis=1)
+        in_space = spans[:, :-1]
+        scores = (-value - total, in_space.max(axis=1), -value / np.maximum(total, 1e-15))
+        for own, axes, score, axis in zip(
+            self._best, self._axes, scores, (longest, in_space.argmax(axis=1), longest), strict=True
+        ):
+            better = score > own[cells]
+            own[cells[better]] = score[better]
+            axes[cells[better]] = axis[better]
+
+    def axis(self, depth: Index, *, timed: bool) -> Index:
+        """Return the axis for each cell, shape (n,); it depends on the number of divisions ``depth`` (n,) so far."""
+        turns = np.array((0, 1, 0, 2) if timed else (0, 1))
+        return np.asarray(self._axes[turns[depth % len(turns)], np.arange(len(depth))])
+
+
+def classified(leg: Leg, cells: Cells, *, timed: bool) -> tuple[Cells, Bools]:
+    """Find out which cells are blocked, which are free, and along which axis to divide them.
+
+    Args:
+        leg: obstacles, limits and motion.
+        cells: new cells.
+        timed: whether cells may be divided in time. If False, a limit that blocks a cell only at some time is ignored.
+
+    Returns:
+        The cells, and whether each cell is blocked, shape (n,).
+    """
+    n = len(cells)
+    blocked, free, choice = np.zeros(n, dtype=bool), np.ones(n, dtype=bool), _Choice(n)
+    may_wait = (cells.level < TIME_LEVELS) & timed
+    _apply_limits(leg, cells, blocked, free if timed else None, choice, may_wait)
+    low, high = leg.motion_box(cells.level, cells.at)
+    d = leg.dimension
+    low[..., :d] += cells.low[:, None]
+    high[..., :d] += cells.high[:, None]
+    for k, (obstacle, need) in enumerate(leg.pairs):
+        left = np.flatnonzero(~blocked)
+        centre, half = 0.5 * (low[left, k] + high[left, k]), 0.5 * (high[left, k] - low[left, k])
+
+        def distance(points: Array, obstacle: Any = obstacle, need: float = need) -> Array:
+            return np.asarray(obstacle.signed_distance(points @ leg.frame) - need)
+
+        value, gradient = obstacle.distance_and_gradient(centre @ leg.frame)
+        value = value - need
+        slopes = np.abs(gradient @ leg.frame.T)
+        near = np.flatnonzero(value < np.einsum("ne,ne->n", slopes, half) + _ROUNDING)  # the tangent bounds the rest
+        left, centre, half, value = left[near], centre[near], half[near], value[near]
+        free[left] = False
+        rises = _rises(distance, centre, half, value)
+        own = np.divide(
+            0.5 * (cells.high - cells.low)[left], half[:, :d], out=np.ones((len(left), d)), where=half[:, :d] > _STILL
+        )
+        in_space = rises[:, :d] * own
+        in_time = (rises.sum(axis=1) - in_space.sum(axis=1)) * may_wait[left]
+        choice.add(left, value, np.column_stack([in_space, in_time]))
+        deep = np.flatnonzero(value + rises.max(axis=1, initial=0.0) < -_ROUNDING)
+        blocked[left[deep[_contained(distance, centre[deep], half[deep])]]] = True
+    axis = choice.axis(cells.depth, timed=timed)
+    return Cells(cells.low, cells.high, cells.level, cells.at, cells.depth, free & ~blocked, axis), blocked
+
+
+def _apply_limits(leg: Leg, cells: Cells, blocked: Bools, free: Bools | None, choice: _Choice, may_wait: Bools) -> None:
+    """Apply the largest displacement and the forbidden directions; change ``blocked``, ``free`` and ``choice``.
+
+    If ``free`` is None, a limit that blocks only a part of a cell is ignored.
+    """
+    first, last = leg.tip_box(cells.level, cells.at)
+    gap = np.maximum(np.maximum(first - cells.high, cells.low - last), 0.0)
+    blocked |= np.linalg.norm(gap, axis=1) > MAX_DISPLACEMENT + _ROUNDING
+    own, its = 0.5 * (cells.high - cells.low), 0.5 * (last - first)
+    away = 0.5 * (cells.low + cells.high) - 0.5 * (first + last)
+    far = np.linalg.norm(away, axis=1)
+    limits = [(MAX_DISPLACEMENT - far, away / np.maximum(far, _STILL)[:, None], np.linalg.norm(own + its, axis=1))]
+    for f in leg.one_sided:
+        reach = (own + its) @ np.abs(f)
+        blocked |= away @ f - reach > _ROUNDING
+        limits.append((-(away @ f), np.broadcast_to(f, away.shape), reach))
+    if free is None:
+        return
+    for value, slopes, reach in limits:
+        near = np.flatnonzero(value <= reach)
+        free[near] = False
+        steep = np.abs(slopes[near])
+        in_time = np.einsum("nd,nd->n", steep, its[near]) * may_wait[near]
+        choice.add(near, value[near], np.column_stack([steep * own[near], in_time]))
+
+
+def _rises(distance: Callable[[Array], Array], centre: Array, half: Array, value: Array) -> Array:
+    """Return how much a convex function rises from the centre of boxes to their faces, along each axis, (n, 3) [m].
+
+    Args:
+        distance: the function, for points (..., 3).
+        centre: centres of the boxes, shape (n, 3) [m].
+        half: half the sizes of the boxes, shape (n, 3) [m].
+        value: values at the centres, shape (n,) [m].
+    """
+    rises = np.zeros(centre.shape)
+    for axis in np.flatnonzero(half.max(axis=0, initial=0.0) > _STILL):
+        step = half[:, axis, None] * np.eye(3)[axis]
+        rises[:, axis] = distance(np.stack([centre - step, centre + step])).max(axis=0) - value
+    return np.maximum(rises, 0.0)
+
+
+def _contained(distance: Callable[[Array], Array], centre: Array, half: Array) -> Bools:
+    """Return for each box whether all its corners are inside, where the function ``distance`` is negative."""
+    answer = np.ones(len(centre), dtype=bool)
+    thick = [1 if extent > _STILL else 0 for extent in half.max(axis=0, initial=0.0)]
+    for corner in np.ndindex(*(1 + x for x in thick)):
+        signs = np.where(np.array(thick) > 0, 2.0 * np.array(corner) - 1.0, 0.0)
+        rest = np.flatnonzero(answer)
+        answer[rest] = distance(centre[rest] + signs * half[rest]) < -_ROUNDING
+    return answer

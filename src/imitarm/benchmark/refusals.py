@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.benchmark.avoidance import learn
-from imitarm.benchmark.refusal_oracle import Answer, answer, is_solved
+from imitarm.benchmark.refusal_oracle import answer, is_solved
+from imitarm.benchmark.refusal_proof import Answer
 from imitarm.benchmark.refusal_question import Question, separation
 from imitarm.benchmark.static_scenes import StaticCase
 from imitarm.benchmark.tables import Table

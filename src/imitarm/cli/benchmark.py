@@ -19,7 +19,7 @@ from imitarm.benchmark.placement_results import Setup, load_results
 from imitarm.benchmark.placement_tables import placement_tables
 from imitarm.benchmark.provenance import code_version, origin
 from imitarm.benchmark.recordings import KINDS
-from imitarm.benchmark.refusal_oracle import Answer
+from imitarm.benchmark.refusal_proof import Answer
 from imitarm.cli.benchmark_options import add_fill, add_workers, place_of, report_tables, workers_of
 from imitarm.cli.outputs import check_outputs, same_place
 from imitarm.cli.robot_options import add_robot_options

@@ -1,4 +1,4 @@
-"""Paths along a way through free cells: where the path crosses from cell to cell, and when."""
+"""Paths along a route through free cells: where the path crosses from cell to cell, and when."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.benchmark.refusal_question import MAX_STEP_RATIO
+from imitarm.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-_POINTS = 400  # of a way, at which it may be at the time of a sample
+_POINTS = 400  # of a route, at which it may be at the time of a sample
 _STEADY = 4.0  # weight of squared steps beside squared displacements
 
 
@@ -55,24 +56,24 @@ def even(points: Array, earliest: Array, latest: Array) -> Array:
     return np.concatenate([[0.0], inner, [1.0]])
 
 
-def beside(way: Array, times: Array, nominal: Array) -> tuple[Array, Array]:
-    """Follow a way so that the displacement from the nominal path is small at all times.
+def beside(route: Array, times: Array, nominal: Array) -> tuple[Array, Array]:
+    """Follow a route so that the displacement from the nominal path is small at all times.
 
-    Dynamic programming finds the point of the way for each sample. It minimises the sum of the squared displacements
-    and of the weighted squared steps along the way. The path never goes backwards on the way, and no step is longer
+    Dynamic programming finds the point of the route for each sample. It minimises the sum of the squared displacements
+    and of the weighted squared steps along the route. The path never goes backwards on the route, and no step is longer
     than permitted.
 
     Args:
-        way: corners of a polyline, shape (m, d) [m].
+        route: corners of a polyline, shape (m, d) [m].
         times: times of the samples, shape (n,).
         nominal: nominal path at the samples, shape (n, d) [m].
 
     Returns:
         Times (n,) and points (n, d) [m] of the path. If no such path is quick enough, it is followed at constant speed.
     """
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(route, axis=0), axis=1))])
     at = np.linspace(0.0, length[-1], _POINTS)
-    points = np.stack([np.interp(at, length, column) for column in way.T], axis=1)
+    points = np.stack([np.interp(at, length, column) for column in route.T], axis=1)
     longest = 0.8 * MAX_STEP_RATIO * np.linalg.norm(np.diff(nominal, axis=0), axis=1).max()
     reach = min(int(longest / max(at[1], 1e-12)), _POINTS - 1)
     steps = _STEADY * (np.arange(reach + 1) * at[1]) ** 2
@@ -86,8 +87,14 @@ def beside(way: Array, times: Array, nominal: Array) -> tuple[Array, Array]:
         from_[i] = np.arange(_POINTS) - back
         cost = options[np.arange(_POINTS), back] + np.sum((points - nominal[i]) ** 2, axis=1)
     if not np.isfinite(cost[-1]):
-        return times, np.stack([np.interp(times * length[-1], length, column) for column in way.T], axis=1)
+        return times, np.stack([np.interp(times * length[-1], length, column) for column in route.T], axis=1)
     chosen = np.full(len(times), _POINTS - 1)
     for i in range(len(times) - 1, 0, -1):
         chosen[i - 1] = from_[i, chosen[i]]
     return times, points[chosen]
+
+
+def at_samples(nominal: Trajectory, times: Array, positions: Array) -> tuple[Array, Array]:
+    """Return the times (n,) and displacements (n, 3) [m] of the samples of a polyline: ``positions`` at ``times``."""
+    moved = np.stack([np.interp(nominal.times, times, column) for column in positions.T], axis=1)
+    return nominal.times, moved - nominal.positions
