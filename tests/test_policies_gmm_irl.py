@@ -11,11 +11,11 @@ from scipy.linalg import cholesky_banded
 from imitarm.benchmark import train_irl
 from imitarm.benchmark.avoidance import learn
 from imitarm.benchmark.families import CLEARANCE, TOOL_RADIUS, sparse_clutter
+from imitarm.benchmark.train_irl import expectation, first_weights, inverse_hessian, learn_weights
 from imitarm.policies import HORIZONTAL_ONLY, NOT_DOWN
 from imitarm.policies.baselines.baseline_policy import ToolGaps
 from imitarm.policies.baselines.expert import PathProblem
 from imitarm.policies.baselines.gmm_irl import WEIGHTS, GmmIrl, learned_weights, path_cost
-from imitarm.policies.baselines.irl_learning import expectation, first_weights, inverse_hessian, learn_weights
 from imitarm.policies.baselines.path_cost import FEATURES, N_FREE, PathCost
 from imitarm.scene import Scene, Sphere
 

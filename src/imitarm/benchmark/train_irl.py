@@ -1,7 +1,22 @@
-"""Learn the weights of the baseline ``gmm-irl``: ``python -m imitarm.benchmark.train_irl --output weights.json``.
+r"""Learn the weights of the baseline ``gmm-irl``: ``python -m imitarm.benchmark.train_irl --output weights.json``.
 
 The demonstrations are the best paths of the expert (:mod:`imitarm.policies.baselines.expert`) around one obstacle, half
 of them in a plane and half in space, in scenes with the seeds of training. The result depends only on the arguments.
+
+Inverse reinforcement learning finds the weights of the path cost under which the demonstrated paths are most likely.
+The maximum-entropy model gives a path ``X`` the probability ``p(X) = exp(-J_w(X)) / Z_w`` (Ziebart et al. 2008). The
+integral ``Z_w`` is replaced by Laplace's approximation at the local minimum ``X*`` that belongs to the demonstration
+``X_d`` (Levine and Koltun 2012 use the same approximation at ``X_d``). Up to a constant, the log-likelihood is::
+
+    L(w) = sum_d [J_w(X*) - J_w(X_d) + 1/2 log det H_w(X*)],     H_w = Hessian of J_w
+
+and its derivative, with ``H_k`` the Hessian of feature ``k``, matches features::
+
+    dL/dw_k = sum_d [E phi_k - phi_k(X_d)],     E phi_k = phi_k(X*) + 1/2 tr(H_w^-1 H_k)
+
+The weights stay positive, because their logarithms are learned, by Fisher scoring: the covariance of the features is
+the second derivative of ``L``, and ``Cov(phi_k, phi_l) = grad phi_k^T H^-1 grad phi_l + 1/2 tr(H^-1 H_k H^-1 H_l)``. A
+normal prior on the logarithms keeps those weights finite on which the demonstrations have no influence.
 """
 
 from __future__ import annotations
@@ -11,24 +26,148 @@ import json
 import shlex
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
 
 from imitarm.benchmark.avoidance import learn
 from imitarm.benchmark.families import CLEARANCE, TOOL_RADIUS, sparse_clutter
 from imitarm.benchmark.provenance import code_version
+from imitarm.errors import InputError
 from imitarm.policies.baselines.baseline_policy import ToolGaps
 from imitarm.policies.baselines.expert import PathProblem, expert_paths
 from imitarm.policies.baselines.gmm_irl import path_cost
-from imitarm.policies.baselines.irl_learning import learn_weights
 from imitarm.policies.baselines.path_cost import FEATURES, PathCost
 
 Array = NDArray[np.float64]
 
 _TOOL = [[0.0, 0.0, 0.0, TOOL_RADIUS]]
+_FIRST_STEP = 1.0  # largest change of the logarithm of a weight in one iteration
+_GROWTH, _SHRINKAGE = 1.2, 0.4  # of this limit, if the change keeps or reverses its direction
+_SETTLED = 1e-2  # gain of log-likelihood that one more step promises, per demonstration: less ends the learning
+_SHIFTS = (0.0, *np.logspace(-10, 0, 11))  # of an indefinite Hessian, relative to its largest entry
+
+
+class Expectation(NamedTuple):
+    """Moments of the features in one scene.
+
+    Attributes:
+        minimum: the deviation of the local minimum, shape (94, k) [m].
+        mean: expected features, shape (m,).
+        covariance: covariance of the features, shape (m, m).
+    """
+
+    minimum: Array
+    mean: Array
+    covariance: Array
+
+
+class Learned(NamedTuple):
+    """The result of learning.
+
+    Attributes:
+        weights: w, shape (m,).
+        demonstrated: mean features of the demonstrations, shape (m,).
+        expected: mean expected features under the weights, shape (m,).
+        n_iterations: number of iterations.
+    """
+
+    weights: Array
+    demonstrated: Array
+    expected: Array
+    n_iterations: int
+
+
+def inverse_hessian(cost: PathCost, weights: Array, blocks: Array) -> Array:
+    """Return the inverse of the Hessian of J, shape (94 k, 94 k); an indefinite Hessian is made positive definite."""
+    band = cost.hessian(weights, blocks)
+    for shift in _SHIFTS:
+        shifted = band.copy()
+        shifted[-1] += shift * band[-1].max()
+        try:
+            factor = cholesky_banded(shifted)
+        except LinAlgError:
+            continue
+        return np.asarray(cho_solve_banded((factor, False), np.eye(band.shape[1])))
+    raise InputError("the Hessian of the path cost is not finite")
+
+
+def expectation(cost: PathCost, weights: Array, start: Array) -> Expectation:
+    """Return Laplace's approximation of the features' moments at the local minimum reached from ``start`` (94, k)."""
+    minimum = cost.minimised(weights, start)
+    blocks = cost.blocks(minimum)
+    inverse = inverse_hessian(cost, weights, blocks)
+    n, k = minimum.shape
+    scaled = [_times_blocks(inverse, part) for part in blocks]
+    scaled[1] = _times_smoothness(inverse, 2.0 * cost.smoothness, k)
+    traces = np.array([np.trace(part) for part in scaled])
+    flat = np.stack([part.ravel() for part in scaled])
+    crossed = np.stack([part.T.ravel() for part in scaled])
+    slopes = cost.gradients(minimum).reshape(-1, n * k)
+    covariance = slopes @ inverse @ slopes.T + 0.5 * flat @ crossed.T
+    return Expectation(minimum, cost.features(minimum) + 0.5 * traces, covariance)
+
+
+def _times_blocks(matrix: Array, blocks: Array) -> Array:
+    """Return ``matrix @ B`` for the block-diagonal matrix B of blocks (n, k, k)."""
+    n, k, _ = blocks.shape
+    return np.asarray(np.einsum("rij,ijl->ril", matrix.reshape(-1, n, k), blocks).reshape(matrix.shape))
+
+
+def _times_smoothness(matrix: Array, smoothness: Array, k: int) -> Array:
+    """Return ``matrix @ kron(smoothness, I)``, with the identity of size k."""
+    parts = matrix.reshape(len(matrix), -1, k)
+    return np.asarray(np.moveaxis(np.moveaxis(parts, 1, 2) @ smoothness, 1, 2).reshape(matrix.shape))
+
+
+def first_weights(costs: Sequence[PathCost], demonstrated: Array) -> Array:
+    """Return weights with which all features contribute equally to a cost of half the number of free coordinates."""
+    freedom = np.mean([cost.precisions.shape[0] * cost.precisions.shape[1] for cost in costs])
+    part = 0.5 * float(freedom) / len(FEATURES)
+    return np.asarray(part / np.where(demonstrated > 1e-6, demonstrated, part))
+
+
+def learn_weights(
+    costs: Sequence[PathCost],
+    demonstrations: Sequence[Array],
+    *,
+    prior: float = 3.0,
+    iterations: int = 40,
+    on_iteration: Callable[[int, Array], None] | None = None,
+) -> Learned:
+    """Learn the weights of the features.
+
+    Args:
+        costs: one for each demonstration.
+        demonstrations: deviations, each of shape (94, k) [m].
+        prior: standard deviation of the logarithm of each weight about its first value.
+        iterations: largest number of iterations.
+        on_iteration: function called with the number of the iteration and the weights.
+    """
+    shown = np.mean([cost.features(d) for cost, d in zip(costs, demonstrations, strict=True)], axis=0)
+    first = np.log(first_weights(costs, shown))
+    logarithm, minima = first.copy(), list(demonstrations)
+    expected, iteration = shown, 0
+    limit, before = np.full(len(first), _FIRST_STEP), np.zeros(len(first))
+    for iteration in range(1, iterations + 1):
+        w = np.exp(logarithm)
+        found = [expectation(cost, w, start) for cost, start in zip(costs, minima, strict=True)]
+        expected = np.mean([part.mean for part in found], axis=0)
+        slope = len(costs) * w * (expected - shown) - (logarithm - first) / prior**2
+        information = np.sum([part.covariance for part in found], axis=0) * np.outer(w, w)
+        step = np.linalg.solve(information + np.eye(len(w)) / prior**2, slope)
+        limit = limit * np.where(step * before < 0.0, _SHRINKAGE, _GROWTH)
+        before = np.clip(step, -limit, limit)
+        logarithm = logarithm + before
+        if on_iteration is not None:
+            on_iteration(iteration, np.exp(logarithm))
+        if 0.5 * slope @ step < _SETTLED * len(costs):
+            break
+    return Learned(np.exp(logarithm), shown, expected, iteration)
 
 
 def demonstrations(n_scenes: int, first_seed: int = 0) -> Iterator[tuple[PathCost, Array]]:
@@ -53,7 +192,7 @@ def demonstrations(n_scenes: int, first_seed: int = 0) -> Iterator[tuple[PathCos
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Learn the weights and write them with their origin."""
-    parser = argparse.ArgumentParser(prog="python -m imitarm.benchmark.train_irl", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m imitarm.benchmark.train_irl", description=__doc__.split("\n\n")[0])
     parser.add_argument("--scenes", type=int, default=200, help="number of training scenes (default: 200)")
     parser.add_argument("--first-seed", type=int, default=0, help="seed of the first scene (default: 0)")
     parser.add_argument("--iterations", type=int, default=60, help="largest number of iterations (default: 60)")

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from imitarm.benchmark import avoidance, placement_comparison, placements, real_motions, refusals
+from imitarm.benchmark import avoidance, packing, placement_comparison, placements, real_motions, refusals
 from imitarm.benchmark.experiment import METHODS, Result
 from imitarm.benchmark.mapping import MappingBenchmark, run_all, tables, write_tables
 from imitarm.benchmark.mapping_tables import TEST, Results
@@ -28,6 +28,7 @@ from imitarm.cli.screen import progress_bar, remark, say
 from imitarm.errors import InputError
 from imitarm.policies import POLICIES
 from imitarm.policies.adaptation import ADAPTERS
+from imitarm.tasks.packing_run import OBSERVERS
 
 OTHERS = ("imitarm.cli.benchmark_static:add_static", "imitarm.cli.benchmark_tracking:add_tracking")
 """Benchmarks with a file of their own: the functions that add their parsers."""
@@ -43,6 +44,7 @@ examples:
   imitarm benchmark placements --skill pour.json shelf.json --robots sawyer panda --tool gripper --jobs 2
   imitarm benchmark placements --policies acfra rrt-connect --max-tilt 30 --out placements.jsonl
   imitarm benchmark comparison placements.jsonl
+  imitarm benchmark packing --seeds 100 --out packing.jsonl
   imitarm benchmark people recordings person.mp4
   imitarm benchmark refusals --scenes 1000
   imitarm benchmark static --count 100 --out static
@@ -118,6 +120,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_fill(third)
     third.set_defaults(benchmark=_refusals)
     _add_placements(parsers)
+    packed = parsers.add_parser(
+        "packing", help="pick a cube and put it into a moving box while a bottle is pushed about (thesis Fig 5.6)"
+    )
+    packed.add_argument("--seeds", type=int, default=20, metavar="N", help="number of runs; default: 20")
+    packed.add_argument("--first", type=int, default=0, metavar="N", help="seed of the first run; default: 0")
+    packed.add_argument(
+        "--observer", choices=OBSERVERS, default="sensor", help="how box and bottle are observed; default: sensor"
+    )
+    packed.add_argument("--out", type=Path, metavar="FILE", help="file for the results; an interrupted run continues")
+    add_workers(packed)
+    add_fill(packed)
+    packed.set_defaults(benchmark=_packing)
     for member in OTHERS:
         module, _, function = member.partition(":")
         getattr(importlib.import_module(module), function)(parsers)
@@ -270,6 +284,23 @@ def _refusals(arguments: argparse.Namespace) -> int:
     for v in doubtful:
         say(f"seed {v.seed} ({v.family}): {'violated' if v.is_violation else f'refused, {v.oracle.value}'}")
     return int(any(v.is_violation for v in verdicts))
+
+
+def _packing(arguments: argparse.Namespace) -> int:
+    """Run the packing task with many seeds and print its table."""
+    place = place_of(arguments, "packing")
+    with progress_bar() as progress:
+        bar = progress.add_task("packing", total=arguments.seeds)
+        results = packing.run_packings(
+            arguments.seeds,
+            first=arguments.first,
+            observer=arguments.observer,
+            workers=workers_of(arguments),
+            out=arguments.out,
+            on_done=lambda done, total: progress.update(bar, completed=done, total=total),
+        )
+    report_tables(packing.packing_tables(results), place, [result.code for result in results])
+    return 0
 
 
 def _placements(arguments: argparse.Namespace) -> int:

@@ -16,6 +16,7 @@ from imitarm.scene import Scene
 from imitarm.tasks.packing import CLOSED, OPEN, PackingTask, packing_skills
 from imitarm.trajectory import Rollout
 
+Observer = Callable[[PackingTask, SimulatedRobot], Callable[[float], Scene]]
 DT = 0.01  # [s] control period
 _NEAR_CUBE, _NEAR_BOX = 0.004, 0.015  # [m] from the goal: the gripper closes on the cube, opens above the box
 _FINGERS = 1.0  # [s] in which the fingers close or open
@@ -55,7 +56,7 @@ def run_packing(
     task: PackingTask,
     *,
     arm: ArmModel | None = None,
-    observer: Callable[[PackingTask, SimulatedRobot], Callable[[float], Scene]] | None = None,
+    observer: Observer | None = None,
     on_step: Callable[[Step], None] | None = None,
 ) -> Rollout:
     """Run the task once.
@@ -64,7 +65,7 @@ def run_packing(
         task: the task.
         arm: the arm, if it has been loaded already.
         observer: function that returns the ``observe`` of :func:`~imitarm.control_loop.reproduce` for the task and its
-            simulated robot; None: :func:`sensed`.
+            simulated robot, see :data:`OBSERVERS`; None: :func:`sensed`.
         on_step: called after each step.
 
     Returns:
@@ -82,3 +83,13 @@ def sensed(task: PackingTask, robot: SimulatedRobot) -> TrackedScene:
     """Observe box and bottle with a simulated sensor (5 mm noise, 30 Hz, 33 ms) and a tracker."""
     del robot
     return TrackedScene(task.truth(), SensorModel(seed=task.seed), ObstacleTracker())
+
+
+def exact(task: PackingTask, robot: SimulatedRobot) -> Callable[[float], Scene]:
+    """Observe the true box and bottle, with their true velocities and without delay."""
+    del robot
+    return task.truth().at
+
+
+OBSERVERS: dict[str, Observer] = {"exact": exact, "sensor": sensed}
+"""Ways to observe box and bottle, by name."""

@@ -53,7 +53,7 @@ class GmmIrl(BaselinePolicy):
     The cost ``J = sum_k w_k phi_k`` has features about the deviation from the learned path, the jerk of the deviation,
     and the obstacles (:mod:`imitarm.policies.baselines.path_cost`). The weights were learned by maximum-entropy inverse
     reinforcement learning from the optimal paths of an independent expert in other scenes
-    (:mod:`imitarm.policies.baselines.irl_learning`). L-BFGS finds a local minimum from the learned path, and from paths
+    (:mod:`imitarm.benchmark.train_irl`). L-BFGS finds a local minimum from the learned path, and from paths
     that are displaced to each side; the policy follows the minimum of least cost.
 
     Among obstacles that move, the cost is minimised again 30 times a second over the next 20 points
