@@ -30,7 +30,11 @@ from imitarm.policies import POLICIES
 from imitarm.policies.adaptation import ADAPTERS
 from imitarm.tasks.packing_run import OBSERVERS
 
-OTHERS = ("imitarm.cli.benchmark_static:add_static", "imitarm.cli.benchmark_tracking:add_tracking")
+OTHERS = (
+    "imitarm.cli.benchmark_static:add_static",
+    "imitarm.cli.benchmark_tracking:add_tracking",
+    "imitarm.cli.benchmark_perception:add_perception",
+)
 """Benchmarks with a file of their own: the functions that add their parsers."""
 
 EPILOG = """\
@@ -50,6 +54,7 @@ examples:
   imitarm benchmark static --count 100 --out static
   imitarm benchmark static compare static --report static.html
   imitarm benchmark tracking --data recordings --report tracking.html
+  imitarm benchmark perception --count 105
 
 'mapping' saves each result in the folder --out, and 'placements' in the file --out.
 If one of them was interrupted, the same command continues where it stopped.

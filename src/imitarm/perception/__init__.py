@@ -12,10 +12,12 @@ from imitarm.perception.obstacle_detector import ObstacleDetector
 from imitarm.perception.point_cloud import PointCloud
 from imitarm.perception.segmentation import fit_plane
 from imitarm.perception.self_filter import SelfFilter
+from imitarm.perception.shape_choice import SHAPES
 from imitarm.perception.tracker import ObstacleTracker
 from imitarm.perception.tracks import TrackedObstacle
 
 __all__ = [
+    "SHAPES",
     "Consistency",
     "CoverageMargin",
     "DepthFrame",

@@ -63,3 +63,12 @@ class FreeSpace:
         with np.errstate(invalid="ignore"):
             behind = self._depth[pixel] > z + margin + 3.0 * self._sigma(z)
         return empty | (inside & behind)
+
+    def below(self, points: Array, reach: float) -> Array:
+        """Return the nearest points on the known surfaces of those ``points`` (n, 3) that are within ``reach`` [m]."""
+        found = [np.zeros((0, 3))]
+        for surface in self._surfaces:
+            distance, normal = surface.distances_at(points, True)
+            near = (distance > 0.0) & (distance < reach)
+            found.append(points[near] - distance[near, None] * normal[near])
+        return np.concatenate(found)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, uniform_filter
 
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
@@ -183,8 +183,7 @@ class ObstacleDetector:
             plane = segmentation.fit_plane(measured.points, normal=_UP)
             surfaces = surfaces if plane is None else (*surfaces, plane)
         for surface in surfaces:
-            margin = self.surface_margin + 3.0 * self.noise.sigma(measured.depth)
-            measured = measured.only(surface.distances_at(measured.points, False)[0] > margin)
+            measured = measured.only(self._off(surface, measured, frame))
         if self.self_filter is None:
             return measured, surfaces
         own = self.self_filter.on_arm(measured.points, frame.stamp, 2.0 * self.noise.sigma(measured.depth))
@@ -194,6 +193,26 @@ class ObstacleDetector:
             beside = binary_dilation(image.reshape(frame.depth.shape), np.ones((3, 3), dtype=bool))
             own |= beside.ravel()[measured.pixel]  # mixed pixels at the outline of the arm
         return measured.only(~own), surfaces
+
+    def _off(self, surface: Obstacle, measured: _Measured, frame: Frame) -> NDArray[np.bool_]:
+        """Return which points don't belong to a surface, shape (n,).
+
+        A single point must be three standard deviations above the surface. Less is enough if neighbouring pixels are
+        above it too: the mean of nine has a third of the noise.
+        """
+        sigma = self.noise.sigma(measured.depth)
+        height = surface.distances_at(measured.points, False)[0]
+        off = height > self.surface_margin + 3.0 * sigma
+        if measured.pixel is not None and isinstance(frame, DepthFrame):
+            sums, counts = np.zeros(frame.depth.size), np.zeros(frame.depth.size)
+            sums[measured.pixel], counts[measured.pixel] = height, 1.0
+            shape = frame.depth.shape
+            total, count = (uniform_filter(v.reshape(shape), 3, mode="constant").ravel() for v in (sums, counts))
+            mean = total[measured.pixel] / np.maximum(count[measured.pixel], 1e-9)
+            enough = count[measured.pixel] > 6.5 / 9.0
+            low = self.surface_margin + 1.2 * sigma
+            off |= enough & (mean > low) & (height > self.surface_margin)
+        return off
 
     def _clusters(self, measured: _Measured) -> list[_Measured]:
         """Return the points of each object."""

@@ -20,9 +20,11 @@ Array = NDArray[np.float64]
 SHAPES = ("sphere", "cylinder", "capsule", "box", "convex_hull")
 _PARAMETERS = {"sphere": 4, "cylinder": 7, "capsule": 7, "box": 9}
 _DIRECTIONS = 64  # surface points of a shape that are compared with the free space
-_FLOATING = 0.2  # largest fraction of a shape's surface in the free space
+_WITHIN = 0.8  # where these points are, from the middle of the shape to its surface: a corner may be seen to be empty
+_FLOATING = 0.25  # largest fraction of a shape's surface in the free space
 _RELATED = 4.0  # neighbouring points have similar errors: so many points count as one
 _GRID = np.stack(np.meshgrid([-0.9, 0.0, 0.9], [-0.9, 0.0, 0.9]), axis=-1).reshape(-1, 2)
+_FEW_EMPTY = 0.2  # fraction of the samples of a new layer in empty space: the layer does not belong to the object
 _MOST_GROWN = 0.3  # [m] by which an unseen side is extended at most
 
 
@@ -37,8 +39,9 @@ def fit_shape(
 
     .. math:: n \log s^2 + k \log n
 
-    A shape is left out if more than a fifth of its surface would stand where the camera saw nothing. If every shape
-    is left out, or the best leaves distances far above the noise, the hull of the points is used.
+    A shape is left out if more than a quarter of its surface would stand where the camera saw nothing. If every shape
+    is left out, or the best leaves distances far above the noise, the hull of the points is used. A radius is enlarged
+    by its standard deviation, and by up to three if the object is seen to be wider.
 
     Then, ends and faces that the camera did not see grow until they reach space that is seen to be empty, at most by
     the size of the visible part or 0.3 m. At last, the shape grows until it contains every visible point, up to twice
@@ -64,20 +67,23 @@ def fit_shape(
     for kind in (kind for kind in _PARAMETERS if kind in shapes):
         penalty = _PARAMETERS[kind] * np.log(count)
         least = min(scored, key=lambda entry: entry[0])[0] if scored else np.inf
-        if least <= count * np.log(floor**2) + penalty:  # no shape with more parameters can be better
+        if least < count * np.log(floor**2) + penalty:  # no shape with more parameters can be better
             break
         for fit in candidates(visible, kind):
             distances = np.abs(fit.obstacle.distances_at(visible.points, False)[0])
-            rms = float(np.sqrt(np.mean(np.minimum(distances, 10.0 * floor) ** 2)))
-            scored.append((float(count * np.log(max(rms, floor) ** 2) + penalty), rms, fit))
+            capped = np.mean(np.minimum(distances, 4.0 * floor) ** 2)
+            score = count * np.log(max(capped, floor**2)) + penalty
+            scored.append((float(score), float(np.sqrt(np.mean(distances**2))), fit))
     scored.sort(key=lambda entry: entry[0])
     standing = (entry for entry in scored if _floating(entry[2].obstacle, visible, space) <= _FLOATING)
     _, spread, best = next(standing, (np.inf, np.inf, None))
     if best is None or ("convex_hull" in shapes and spread > 2.0 * floor + 0.004):
-        best = shape_fit.hull(visible)
+        removed = 0.01 + 1.5 * visible.sigma + visible.spacing  # [m] above a surface, where points are lost
+        best = shape_fit.hull(visible, space.below(visible.points, removed))
         spread = visible.spacing
-    obstacle, grown = grow(best.obstacle, visible, space)
-    noise = max(spread, visible.sigma) ** 2 * _RELATED * best.covariance
+    variance = max(spread, visible.sigma) ** 2 * _RELATED
+    obstacle, grown = grow(_wider(best, best.radius * float(np.sqrt(variance))), visible, space)
+    noise = variance * best.covariance
     covariance = noise + (visible.spacing**2 / 12.0 + 1e-6) * np.eye(3) + grown
     return Detection(contain(obstacle, every, 2.0 * visible.sigma), 0.5 * (covariance + covariance.T))
 
@@ -111,6 +117,15 @@ def box_axes(visible: Visible) -> list[Array]:
     return _distinct([direction, np.array([0.0, 0.0, 1.0])])
 
 
+def _wider(fit: Fit, by: float) -> Obstacle:
+    """Return a round shape that is wider by ``by`` [m], and up to three times as much if it was seen to be so wide."""
+    obstacle = fit.obstacle
+    if isinstance(obstacle, Sphere | Cylinder | Capsule):
+        by = min(by, 0.5 * obstacle.radius)
+        return replace(obstacle, radius=max(obstacle.radius + by, min(fit.outline, obstacle.radius + 3.0 * by)))
+    return obstacle
+
+
 def _distinct(directions: list[Array]) -> list[Array]:
     kept: list[Array] = []
     for direction in directions:
@@ -123,7 +138,7 @@ def _floating(obstacle: Obstacle, visible: Visible, space: FreeSpace) -> float:
     """Return the fraction of points on a shape that are in space that the camera saw to be empty."""
     points = obstacle.support(_SPHERE)
     center = obstacle.solid().position
-    return float(space.empty(center + 0.9 * (points - center), margin=0.01 + visible.spacing).mean())
+    return float(space.empty(center + _WITHIN * (points - center), margin=0.01 + visible.spacing).mean())
 
 
 def grow(obstacle: Obstacle, visible: Visible, space: FreeSpace) -> tuple[Obstacle, Array]:
@@ -199,8 +214,8 @@ def _grow_bar(bar: Cylinder | Capsule, visible: Visible, space: FreeSpace) -> tu
 
 
 def _until_empty(samples: Array, lengths: Array, space: FreeSpace, visible: Visible) -> float:
-    """Return the length at which the first of ``samples`` (k, m, 3) is in empty space; 0 if it is at the first."""
-    empty = space.empty(samples, margin=0.005).mean(axis=1) > 0.3
+    """Return the length before the first layer of ``samples`` (k, m, 3) in empty space; 0 if it is the first."""
+    empty = space.empty(samples, margin=0.005).mean(axis=1) > _FEW_EMPTY
     if not empty.any():
         return float(lengths[-1])
     first = int(empty.argmax())

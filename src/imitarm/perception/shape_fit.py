@@ -16,7 +16,9 @@ Array = NDArray[np.float64]
 
 _ROUNDS = 8  # Gauss-Newton steps at most
 _SMALL_STEP = 2e-4  # [m] after which a fit has converged
-_LARGEST = 2.0  # [m] of a fitted radius: with a larger one, the points are as good as flat
+_LARGEST = 2.0  # [m] of a fitted radius
+_FLATTEST = 2.0  # largest radius, in half widths of the visible points: with a larger one, they are as good as flat
+_BEYOND = 0.75  # [spacings] from the outermost pixel of an object to its outline, which may be lost
 _NEIGHBOURS = 12  # points from which a normal is estimated
 _YAWS = np.radians(np.arange(0.0, 90.0, 5.0))
 _FINE = np.radians(np.arange(-4.0, 5.0, 1.0))
@@ -52,10 +54,14 @@ class Fit(NamedTuple):
     Attributes:
         obstacle: the shape.
         covariance: covariance of its position for residuals of one metre: the block of ``(J^T J)^-1``, shape (3, 3).
+        radius: standard deviation of its radius for residuals of one metre; 0 for shapes without a radius.
+        outline: half of the width in which the object is seen [m]; 0 for shapes without a radius.
     """
 
     obstacle: Obstacle
     covariance: Array
+    radius: float = 0.0
+    outline: float = 0.0
 
 
 def point_normals(points: Array, origin: Array) -> Array:
@@ -92,9 +98,11 @@ def sphere(visible: Visible) -> Fit | None:
         center, radius = center + steps[0, :3], radius + float(steps[0, 3])
         if _converged(steps):
             break
-    if not _usable(center, radius):
+    if not _usable(center, radius) or radius > _FLATTEST * 0.5 * float(np.ptp(points, axis=0).max()):
         return None
-    return Fit(Sphere(center + shift, max(radius, 0.5 * THINNEST)), np.linalg.inv(normal[0])[:3, :3])
+    inverse = np.linalg.inv(normal[0])
+    shape = Sphere(center + shift, max(radius, 0.5 * THINNEST))
+    return Fit(shape, inverse[:3, :3], float(np.sqrt(inverse[3, 3])), _outline(visible, shape.center, None))
 
 
 def cylinders(visible: Visible, axes: Array) -> list[Fit]:
@@ -108,12 +116,16 @@ def cylinders(visible: Visible, axes: Array) -> list[Fit]:
     for center, axis, radius, inverse in zip(bars.centers, bars.axes, bars.radii.tolist(), bars.inverses, strict=True):
         if not _usable(center, radius):
             continue
+        outline = _outline(visible, center, axis)
+        if radius > _FLATTEST * outline:
+            continue
         along = (visible.points - center) @ axis
         facing = visible.normals @ axis
         low, high = (_end(along, facing, sign, visible) for sign in (-1.0, 1.0))
         pose = Pose(center + 0.5 * (low + high) * axis, rotation_from_z(axis))
         shape = Cylinder(pose, max(radius, 0.5 * THINNEST), max(high - low, THINNEST))
-        fits.append(Fit(shape, _bar_covariance(inverse, axis, 0.5 * (low + high))))
+        covariance = _bar_covariance(inverse, axis, 0.5 * (low + high))
+        fits.append(Fit(shape, covariance, float(np.sqrt(inverse[4, 4])), outline))
     return fits
 
 
@@ -153,10 +165,12 @@ def capsules(visible: Visible, axes: Array) -> list[Fit]:
     fits = []
     for i, radius in enumerate(radii.tolist()):
         a, b = sorted((float(low[i]), float(high[i])))
-        if _usable(centers[i], radius) and max(abs(a), abs(b)) < _LARGEST:
+        outline = _outline(visible, centers[i], axes[i])
+        if _usable(centers[i], radius) and max(abs(a), abs(b)) < _LARGEST and radius <= _FLATTEST * outline:
             shape = Capsule(centers[i] + a * axes[i], centers[i] + b * axes[i], max(radius, 0.5 * THINNEST))
             inverse = np.asarray(np.linalg.inv(normal[i, :5, :5]), dtype=np.float64)
-            fits.append(Fit(shape, _bar_covariance(inverse, axes[i], 0.5 * (a + b))))
+            covariance = _bar_covariance(inverse, axes[i], 0.5 * (a + b))
+            fits.append(Fit(shape, covariance, float(np.sqrt(inverse[4, 4])), outline))
     return fits
 
 
@@ -191,24 +205,30 @@ def box(visible: Visible, axis: Array) -> Fit:
     return Fit(Box(pose, size), rotation @ np.diag(0.25 * variance.sum(axis=1)) @ rotation.T)
 
 
-def hull(visible: Visible) -> Fit:
+def hull(visible: Visible, lowest: Array | None = None) -> Fit:
     """Enclose the points and a mirrored copy of them behind the object, as its unseen back.
 
     The back of a convex object begins where its outline is seen. The points are mirrored in the plane perpendicular to
-    the line of sight through the farthest points. The depth of the result is at least half of its second-largest
-    visible extent, so that a single flat face becomes a solid.
+    the line of sight behind the farthest points. The result is at least as deep as the object is seen to be narrow, so
+    that a single flat face becomes a solid.
+
+    Args:
+        visible: the points.
+        lowest: more points that the hull contains, for example on the table below the object, shape (m, 3) [m].
     """
     points = visible.points
     sight = points.mean(axis=0) - visible.origin
     sight = sight / np.linalg.norm(sight)
     depth = points @ sight
     across = points - depth[:, None] * sight
-    extents = np.linalg.svd(across - across.mean(axis=0), compute_uv=False) * 2.0 / np.sqrt(len(points))
-    plane = max(float(depth.max()), float(depth.min()) + 0.25 * float(extents[1]) * 2.0, float(depth.min()) + THINNEST)
+    narrow = float(np.linalg.svd(across - across.mean(axis=0), compute_uv=False)[1]) * np.sqrt(12.0 / len(points))
+    near, far = float(depth.min()), float(depth.max())
+    plane = max(far + _BEYOND * visible.spacing, near + 0.5 * (narrow + visible.spacing), near + THINNEST)
     back = points + (2.0 * (plane - depth))[:, None] * sight
-    spread = 0.5 * visible.spacing * _rim(across)
+    spread = _BEYOND * visible.spacing * _rim(across)
     covariance = np.eye(3) / len(points) + np.outer(sight, sight)
-    return Fit(centered_hull(np.concatenate([points + spread, back + spread])), covariance)
+    more = np.zeros((0, 3)) if lowest is None else lowest
+    return Fit(centered_hull(np.concatenate([points + spread, back + spread, more])), covariance)
 
 
 def centered_hull(points: Array) -> ConvexHull:
@@ -280,6 +300,24 @@ def _moved(centers: Array, axes: Array, radii: Array, e1: Array, e2: Array, step
     centers = centers + step[:, :1] * e1 + step[:, 1:2] * e2
     tilted = axes + tilt[:, :1] * e1 + tilt[:, 1:] * e2
     return centers, tilted / np.sqrt(np.einsum("bk,bk->b", tilted, tilted))[:, None], np.abs(radii + step[:, 4])
+
+
+def _outline(visible: Visible, center: Array, axis: Array | None) -> float:
+    """Return half of the width in which an object is seen, across the line of sight, at least half of the thinnest [m].
+
+    A camera sees an object in its full width, unless something hides a part; so no radius is smaller than this. The
+    width of a bar is measured across its axis.
+    """
+    sight = center - visible.origin
+    first, second = np.concatenate(_across((sight / np.linalg.norm(sight))[None]))
+    if axis is None:
+        directions = np.stack([first, second])
+    else:
+        across = np.cross(sight, axis)
+        length = float(np.linalg.norm(across))
+        directions = np.stack([first, second]) if length < 0.3 * np.linalg.norm(sight) else across[None] / length
+    width = float(np.ptp(visible.points @ directions.T, axis=0).min())
+    return max(0.5 * width + _BEYOND * visible.spacing * (1.0 if width > 0.0 else 0.5), 0.5 * THINNEST)
 
 
 def _end(along: Array, facing: Array, sign: float, visible: Visible) -> float:

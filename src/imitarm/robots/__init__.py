@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from imitarm.robots.depth_camera import DepthCamera
 from imitarm.robots.robot import Robot, limit_velocity
 from imitarm.robots.server import RobotServer
 from imitarm.robots.simulated import SimulatedRobot
@@ -10,4 +11,4 @@ from imitarm.robots.world import arm_world
 
 ROBOTS: dict[str, type[Robot]] = {"simulated": SimulatedRobot, "udp": UdpRobot}
 
-__all__ = ["ROBOTS", "Robot", "RobotServer", "SimulatedRobot", "UdpRobot", "arm_world", "limit_velocity"]
+__all__ = ["ROBOTS", "DepthCamera", "Robot", "RobotServer", "SimulatedRobot", "UdpRobot", "arm_world", "limit_velocity"]
