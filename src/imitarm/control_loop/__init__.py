@@ -2,6 +2,15 @@
 
 from imitarm.control_loop.camera_observer import CameraObserver
 from imitarm.control_loop.observer import SensorModel, TrackedScene
+from imitarm.control_loop.person_observer import CombinedObserver, PersonObserver
 from imitarm.control_loop.reproduce import Step, reproduce
 
-__all__ = ["CameraObserver", "SensorModel", "Step", "TrackedScene", "reproduce"]
+__all__ = [
+    "CameraObserver",
+    "CombinedObserver",
+    "PersonObserver",
+    "SensorModel",
+    "Step",
+    "TrackedScene",
+    "reproduce",
+]

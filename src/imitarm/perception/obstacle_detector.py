@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ from scipy.ndimage import binary_dilation, uniform_filter
 
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.pose import Pose
 from imitarm.perception import segmentation
 from imitarm.perception.depth_frame import DepthFrame, Intrinsics
 from imitarm.perception.depth_noise import DepthNoise
@@ -21,8 +23,9 @@ from imitarm.perception.point_cloud import PointCloud
 from imitarm.perception.self_filter import SelfFilter
 from imitarm.perception.shape_choice import SHAPES, fit_shape
 from imitarm.perception.shape_fit import Visible
+from imitarm.perception.target import Target
 from imitarm.scene import Obstacle, Scene
-from imitarm.validation import choice, finite_array, finite_number, flag, instance, whole_number
+from imitarm.validation import choice, finite_array, finite_number, flag, instance, sequence, whole_number
 
 Array = NDArray[np.float64]
 Frame = DepthFrame | PointCloud
@@ -43,6 +46,7 @@ class _Measured(NamedTuple):
     colors: Array | None
     origin: Array
     spacing: float
+    camera: Pose | None = None  # camera_to_base of an image
 
     def only(self, kept: NDArray[np.bool_]) -> _Measured:
         pixel = None if self.pixel is None else self.pixel[kept]
@@ -81,6 +85,8 @@ class ObstacleDetector:
         min_points: least number of points of an object; fewer points count as noise.
         shapes: shapes that may be fitted.
         split: whether clearly concave groups are cut into parts.
+        targets: known objects; a detection that matches one has its name as label. Points of a target's colour form
+            objects of their own, even if they touch others. Without colours in the images, only shapes are compared.
         max_obstacles: largest number of detections; of more, those that are nearest to the camera are kept.
 
     Raises:
@@ -104,6 +110,7 @@ class ObstacleDetector:
         min_points: int = 6,
         shapes: Sequence[str] = SHAPES,
         split: bool = True,
+        targets: Sequence[Target] = (),
         max_obstacles: int = 32,
     ) -> None:
         self.arm = None if arm is None else instance(arm, ArmModel, "ObstacleDetector: arm")
@@ -125,6 +132,7 @@ class ObstacleDetector:
         if not self.shapes:
             raise InputError("ObstacleDetector: shapes must name at least one shape")
         self.split = flag(split, "ObstacleDetector: split")
+        self.targets = sequence(targets, Target, "ObstacleDetector: targets")
         self.max_obstacles = whole_number(max_obstacles, "ObstacleDetector: max_obstacles", at_least=1)
         self.self_filter = (
             None if arm is None else SelfFilter(arm, padding=padding, stamp_uncertainty=stamp_uncertainty)
@@ -161,7 +169,7 @@ class ObstacleDetector:
         if len(measured.points) < self.min_points:
             return []
         space = FreeSpace(frame if isinstance(frame, DepthFrame) else None, surfaces, self.noise.sigma)
-        objects = [part for cluster in self._clusters(measured) for part in self._parts(cluster)]
+        objects = [part for group in self._of_one_color(measured) for part in self._objects(group)]
         objects.sort(key=lambda part: float(part.depth.min()))
         return [self._detection(part, space) for part in objects[: self.max_obstacles]]
 
@@ -214,6 +222,30 @@ class ObstacleDetector:
             off |= enough & (mean > low) & (height > self.surface_margin)
         return off
 
+    def _of_one_color(self, measured: _Measured) -> list[_Measured]:
+        """Return the points of each target's colour, and all other points."""
+        if measured.colors is None:
+            return [measured]
+        groups, rest = [], np.ones(len(measured.points), dtype=bool)
+        for target in self.targets:
+            own = rest & target.has_color(measured.colors) if target.color is not None else np.zeros_like(rest)
+            groups.append(measured.only(own))
+            rest &= ~own
+        return [group for group in (*groups, measured.only(rest)) if len(group.points) >= self.min_points]
+
+    def _objects(self, measured: _Measured) -> list[_Measured]:
+        return [part for cluster in self._clusters(measured) for part in self._parts(cluster)]
+
+    def _label(self, obstacle: Obstacle, colors: Array | None) -> str:
+        """Return the name of the target that an object matches; empty if none."""
+        color = None if colors is None or not self.targets else np.median(colors, axis=0)[None]
+        for target in self.targets:
+            if target.color is not None and (color is None or not target.has_color(color)[0]):
+                continue
+            if target.has_shape(obstacle):
+                return target.name
+        return ""
+
     def _clusters(self, measured: _Measured) -> list[_Measured]:
         """Return the points of each object."""
         index, n = segmentation.voxels(measured.points, self.voxel)
@@ -249,7 +281,9 @@ class ObstacleDetector:
         if n > _MOST_VOXELS:
             centers = centers[np.linspace(0, n - 1, _MOST_VOXELS).astype(int)]
         visible = Visible.of(centers, part.origin, sigma, spacing)
-        return fit_shape(visible, space, self.shapes, part.points)
+        found = fit_shape(visible, space, self.shapes, part.points)
+        label = self._label(found.obstacle, part.colors)
+        return replace(found, label=label, camera_to_base=part.camera)
 
 
 def _take(measured: _Measured, group: NDArray[np.intp]) -> _Measured:
@@ -272,7 +306,8 @@ def _measured(frame: Frame, depth_range: tuple[float, float]) -> _Measured:
     depth = frame.depth.ravel()[pixel]
     points = frame.camera_to_base.apply(_rays(frame.intrinsics)[pixel] * depth[:, None])
     colors = None if frame.color is None else frame.color.reshape(-1, 3)[pixel]
-    return _Measured(points, depth, pixel, colors, frame.camera_to_base.position, frame.spacing)
+    pose = frame.camera_to_base
+    return _Measured(points, depth, pixel, colors, pose.position, frame.spacing, pose)
 
 
 @lru_cache(maxsize=4)

@@ -1,0 +1,124 @@
+"""PersonObserver: the arms of a person as obstacles of a control loop, and several observers as one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+
+from imitarm.capture.skeleton import Skeleton
+from imitarm.control_loop.observer import Tracker
+from imitarm.errors import InputError
+from imitarm.perception import ObstacleTracker, PersonCapsules
+from imitarm.scene import Scene
+from imitarm.validation import finite_number, function, instance
+
+PERSON_NOISE = 2.0
+"""Process noise of a tracker of arms [m^2/s^3]: hands accelerate more than things. With this value, every arm keeps its
+track in the Kinect recordings of gestures."""
+
+_ROUNDING = 1e-9  # [s]
+
+
+class PersonObserver:
+    """The arms of a person as a skeleton camera and a tracker know them; callable as ``observe(t)``.
+
+    A skeleton of the time ``s`` arrives at ``s + latency``. Then its capsules go to the tracker with the stamp ``s``,
+    and ``observe(t)`` returns the tracks predicted to ``t``. If the newest skeleton is older than ``max_age``, the
+    stamp of the scene stays that of the newest skeleton, so that a watchdog can see how old it is.
+
+    Calls must be in the order of time.
+
+    Args:
+        skeletons: skeletons in the order of their times: a :class:`~imitarm.capture.skeleton.SkeletonSource` or any
+            other iterable. It is read until a skeleton has not yet arrived.
+        capsules: turns skeletons into detections.
+        tracker: an :class:`~imitarm.perception.ObstacleTracker` of its own; None: one with :data:`PERSON_NOISE`.
+        latency: time from the exposure to the arrival of a skeleton [s].
+        max_age: age of the newest skeleton at which the camera counts as frozen [s].
+        start: time of the call at which the first skeleton was exposed [s]; None: the times of the skeletons are on the
+            clock of the calls.
+
+    Attributes:
+        n_skeletons: number of skeletons that were used.
+
+    Raises:
+        InputError: when an argument can't be used.
+    """
+
+    def __init__(
+        self,
+        skeletons: Iterable[Skeleton],
+        capsules: PersonCapsules,
+        tracker: Tracker | None = None,
+        *,
+        latency: float = 0.033,
+        max_age: float = 0.25,
+        start: float | None = 0.0,
+    ) -> None:
+        name = type(self).__name__
+        self.capsules = instance(capsules, PersonCapsules, f"{name}: capsules")
+        self.tracker = ObstacleTracker(process_noise=PERSON_NOISE) if tracker is None else tracker
+        self.latency = finite_number(latency, f"{name}: latency", "s", at_least=0.0)
+        self.max_age = finite_number(max_age, f"{name}: max_age", "s", above=self.latency)
+        try:
+            self._skeletons: Iterator[Skeleton] = iter(skeletons)
+        except TypeError as error:
+            raise InputError(f"{name}: skeletons must be an iterable of skeletons, got {skeletons!r}") from error
+        self._start = None if start is None else finite_number(start, f"{name}: start", "s")
+        self._shift: float | None = 0.0 if start is None else None
+        self._waiting: Skeleton | None = None
+        self._stamp: float | None = None
+        self.n_skeletons = 0
+        self.tracker.reset()
+
+    def __call__(self, time: float) -> Scene:
+        """Return the scene at ``time`` [s], from the skeletons that have arrived until then."""
+        time = finite_number(time, "PersonObserver: time", "s")
+        while (stamp := self._next_stamp()) is not None and stamp + self.latency <= time + _ROUNDING:
+            assert self._waiting is not None
+            self.tracker.update(stamp, self.capsules.detections(self._waiting))
+            self._waiting, self._stamp = None, stamp
+            self.n_skeletons += 1
+        fresh = self._stamp is None or time - self._stamp <= self.max_age
+        return self.tracker.scene(time if fresh or self._stamp is None else self._stamp)
+
+    def _next_stamp(self) -> float | None:
+        """Return the time of the next skeleton on the clock of the calls; None at the end."""
+        if self._waiting is None:
+            self._waiting = next(self._skeletons, None)
+            if self._waiting is None:
+                return None
+        if self._shift is None:
+            self._shift = (self._start or 0.0) - self._waiting.time
+        return self._waiting.time + self._shift
+
+
+class CombinedObserver:
+    """Several observers as one, for example a depth camera for things and a skeleton camera for people.
+
+    The scene contains the obstacles of all observers. Its stamp is the oldest of theirs, so that one frozen camera is
+    enough to be seen. Track numbers are made distinct: the tracks of observer ``i`` of ``n`` get the numbers
+    ``n * id + i``.
+
+    Args:
+        observers: functions ``observe(t)``; goal and fixtures are those of the first.
+
+    Raises:
+        InputError: when there is no observer, or one is not a function.
+    """
+
+    def __init__(self, *observers: Callable[[float], Scene]) -> None:
+        if not observers:
+            raise InputError("CombinedObserver: give at least one observer")
+        self._observers = tuple(function(observer, "CombinedObserver: observer") for observer in observers)
+
+    def __call__(self, time: float) -> Scene:
+        """Return the obstacles of all observers at ``time`` [s]."""
+        scenes: list[Scene] = [observe(time) for observe in self._observers]
+        stamp = min(scene.stamp for scene in scenes)
+        n, obstacles = len(scenes), []
+        for i, scene in enumerate(scenes):
+            for obstacle in scene.now(stamp).obstacles:
+                number = obstacle.track_id
+                obstacles.append(obstacle if number is None else replace(obstacle, track_id=n * number + i))
+        return Scene(scenes[0].goal, tuple(obstacles), stamp, scenes[0].fixtures)

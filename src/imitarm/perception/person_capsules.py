@@ -1,0 +1,144 @@
+"""PersonCapsules: the arms of a person as obstacles, so that the camera that teaches also protects."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.capture.skeleton import SIDES, Arm, Skeleton
+from imitarm.kinematics.pose import Pose
+from imitarm.perception.detection import Detection
+from imitarm.scene import Capsule
+from imitarm.validation import choice, finite_number, instance
+
+Array = NDArray[np.float64]
+
+_LONGEST = 0.75  # [m] of an upper arm, or of a forearm with its hand: more was not measured
+_SHOULDER, _ELBOW, _WRIST, _HAND, _TIP, _THUMB = range(6)
+
+
+class PersonCapsules:
+    r"""Turns skeletons into detections: each arm is an upper arm, and a forearm with its hand.
+
+    A capsule around the segment from shoulder to elbow is the upper arm. The other capsule begins at the elbow and ends
+    at the farthest tracked point of the hand; if only the wrist is tracked, it is extended by the length of a hand. Its
+    radius grows until it also contains the wrist, the hand and the thumb of a bent hand, each with half of its
+    thickness.
+
+    Let :math:`\sigma_a` and :math:`\sigma_b` be the standard deviations of the two ends, which depend on whether the
+    camera tracks or infers the joints. The errors of both ends are similar, because most of them come from the posture
+    of the person. The covariance of the middle is therefore not reduced by the mean of two ends:
+
+    .. math:: R = \tfrac12 (\sigma_a^2 + \sigma_b^2)\, I
+
+    A capsule whose ends are lost, or impossibly far apart, is left out; a tracker then predicts it. Each capsule has a
+    label such as ``"person 0 right forearm"``, so that a tracker never confuses two of them.
+
+    Args:
+        sensor_to_base: pose of the skeleton camera; the camera's frame is that of
+            :class:`~imitarm.capture.skeleton.Skeleton` (x to the sensor's left, y up, z away from the sensor).
+        sides: arms of the person.
+        upper_arm_radius: [m].
+        forearm_radius: [m].
+        hand_length: from wrist to finger tips [m].
+        hand_radius: half of the thickness of a hand [m].
+        tracked_sigma: standard deviation of a tracked joint [m].
+        inferred_sigma: standard deviation of an inferred joint [m].
+
+    Raises:
+        UnknownNameError: when a side is neither left nor right.
+        InputError: when an argument can't be used.
+    """
+
+    def __init__(
+        self,
+        sensor_to_base: Pose,
+        *,
+        sides: Sequence[str] = SIDES,
+        upper_arm_radius: float = 0.06,
+        forearm_radius: float = 0.05,
+        hand_length: float = 0.19,
+        hand_radius: float = 0.03,
+        tracked_sigma: float = 0.015,
+        inferred_sigma: float = 0.05,
+    ) -> None:
+        name = type(self).__name__
+        self.sensor_to_base = instance(sensor_to_base, Pose, f"{name}: sensor_to_base")
+        self.sides = tuple(choice(side, SIDES, "side") for side in sides)
+        self.upper_arm_radius = finite_number(upper_arm_radius, f"{name}: upper_arm_radius", "m", above=0.0)
+        self.forearm_radius = finite_number(forearm_radius, f"{name}: forearm_radius", "m", above=0.0)
+        self.hand_length = finite_number(hand_length, f"{name}: hand_length", "m", at_least=0.0)
+        self.hand_radius = finite_number(hand_radius, f"{name}: hand_radius", "m", at_least=0.0)
+        self.tracked_sigma = finite_number(tracked_sigma, f"{name}: tracked_sigma", "m", above=0.0)
+        self.inferred_sigma = finite_number(inferred_sigma, f"{name}: inferred_sigma", "m", at_least=self.tracked_sigma)
+
+    def detections(self, skeleton: Skeleton) -> list[Detection]:
+        """Return the capsules of the arms that the camera sees, in the base frame.
+
+        Raises:
+            InputError: when ``skeleton`` is not a Skeleton.
+        """
+        instance(skeleton, Skeleton, "PersonCapsules: skeleton")
+        found = []
+        for side in self.sides:
+            arm = skeleton.arm(side)
+            points = self.sensor_to_base.apply(np.nan_to_num(arm.points))
+            parts = {"upper arm": self._upper_arm(arm, points), "forearm": self._forearm(arm, points)}
+            for part, detection in parts.items():
+                if detection is not None:
+                    capsule, covariance = detection
+                    found.append(Detection(capsule, covariance, f"person {skeleton.person} {side} {part}"))
+        return found
+
+    def _upper_arm(self, arm: Arm, points: Array) -> tuple[Capsule, Array] | None:
+        if not self._plausible(arm, points, _SHOULDER, _ELBOW):
+            return None
+        capsule = Capsule(points[_SHOULDER], points[_ELBOW], self.upper_arm_radius)
+        return capsule, self._covariance(arm, _SHOULDER, _ELBOW)
+
+    def _forearm(self, arm: Arm, points: Array) -> tuple[Capsule, Array] | None:
+        seen = [i for i in (_WRIST, _HAND, _TIP, _THUMB) if self._plausible(arm, points, _ELBOW, i)]
+        ends = [i for i in (_TIP, _HAND, _WRIST) if i in seen]
+        if not ends:
+            return None
+        start, last = points[_ELBOW], ends[0]
+        along = points[last] - start
+        length = float(np.linalg.norm(along))
+        direction = along / max(length, 1e-6)
+        missing = {_TIP: 0.0, _HAND: 0.5, _WRIST: 1.0}[last] * self.hand_length
+        end = points[last] + missing * direction
+        others = points[seen] - start
+        nearest = np.clip(others @ direction, 0.0, length + missing)
+        beside = np.linalg.norm(others - nearest[:, None] * direction, axis=1)
+        radius = max(self.forearm_radius, float(beside.max()) + self.hand_radius)
+        return Capsule(start, end, radius), self._covariance(arm, _ELBOW, last)
+
+    def _plausible(self, arm: Arm, points: Array, first: int, second: int) -> bool:
+        """Return whether the camera has positions of both joints, which are not too far apart for an arm."""
+        if min(arm.confidence[first], arm.confidence[second]) <= 0.0:
+            return False
+        return float(np.linalg.norm(points[second] - points[first])) <= _LONGEST
+
+    def _covariance(self, arm: Arm, first: int, second: int) -> Array:
+        sigmas = [self.tracked_sigma if arm.confidence[i] >= 1.0 else self.inferred_sigma for i in (first, second)]
+        return float(np.mean(np.square(sigmas))) * np.eye(3)
+
+
+def upright_camera(position: ArrayLike, yaw: float = 0.0) -> Pose:
+    """Return ``sensor_to_base`` of a skeleton camera that stands upright and looks along x of the base.
+
+    Args:
+        position: position of the camera in the base frame, shape (3,) [m].
+        yaw: rotation of the camera about the vertical [rad]; 0: it looks along x, and pi: against x.
+
+    Raises:
+        InputError: when a number is not finite.
+    """
+    yaw = finite_number(yaw, "upright_camera: yaw", "rad")
+    ahead, left = np.array([np.cos(yaw), np.sin(yaw), 0.0]), np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.column_stack([left, [0.0, 0.0, 1.0], ahead])  # the sensor's x (left), y (up) and z (ahead)
+    matrix[:3, 3] = position
+    return Pose.from_matrix(matrix)
