@@ -165,7 +165,7 @@ def test_the_uncertainty_is_as_large_as_the_errors(motion):
     rng = np.random.default_rng(7)
     order = 2 if motion == "constant-acceleration" else 1
     noise = 5.0 if order == 2 else 0.05
-    options = {} if motion == "imm" else {"process_noise": noise}
+    options = {"process_noise": (noise, 10.0) if motion == "imm" else noise}
     F, Q = van_loan(order, noise, 1.0 / 30.0)
     root = np.linalg.cholesky(Q)
     errors, distances = [], []

@@ -7,12 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.perception.motion_filter import Measurements, inverse_3x3
+from imitarm.perception.motion_filter import Innovation, Measurements, inverse_3x3
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 _FORBIDDEN = 1e9  # cost of a pair outside the gate: worse than any number of pairs inside
+_ONES = np.ones(3)
 _NONE = np.empty(0, dtype=np.intp)
 
 
@@ -23,15 +24,23 @@ class Pairs(NamedTuple):
         tracks: indices of tracks, shape (k,).
         detections: index of the detection of each of these tracks, shape (k,).
         distances: normalised innovation squared of each pair, shape (k,).
+        innovation: innovations of the pairs; None if they must be computed again.
     """
 
     tracks: Indices
     detections: Indices
     distances: Array
+    innovation: Innovation | None = None
 
     def joined(self, other: Pairs) -> Pairs:
         """Return both sets of pairs."""
-        return Pairs(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
+        tracks, detections, distances = (np.concatenate(pair) for pair in zip(self[:3], other[:3], strict=True))
+        return Pairs(tracks, detections, distances)
+
+    def in_order(self) -> Pairs:
+        """Return the pairs in the order of their tracks."""
+        order = self.tracks.argsort()
+        return Pairs(self.tracks[order], self.detections[order], self.distances[order])
 
 
 NO_PAIRS = Pairs(_NONE, _NONE, np.empty(0))
@@ -57,35 +66,39 @@ def assign(
     n, m = len(positions), len(measured.positions)
     if not n or not m:
         return NO_PAIRS
-    near = _near(positions, covariances, measured, gate)
-    if allowed is not None:
-        near &= allowed
-    tracks, detections = near.nonzero()
+    tracks, detections = _near(positions, covariances, measured, gate, allowed).nonzero()
     if not len(tracks):
         return NO_PAIRS
-    innovation, jacobian, noise = measured.rows(detections).innovation(positions[tracks])
-    P = covariances[tracks]
-    S = (P if jacobian is None else jacobian @ P @ jacobian.swapaxes(-1, -2)) + noise
-    inverse, determinant = inverse_3x3(S)
-    distance = np.einsum("ki,kij,kj->k", innovation, inverse, innovation)
+    innovation = Innovation.of(positions.take(tracks, 0), covariances.take(tracks, 0), measured.rows(detections))
+    distance = innovation.squared
     possible = distance <= gate
     if not possible.all():
-        tracks, detections, distance = tracks[possible], detections[possible], distance[possible]
-        determinant = determinant[possible]
+        inside = possible.nonzero()[0]
+        tracks, detections, distance = tracks[inside], detections[inside], distance[inside]
+        innovation = innovation.rows(inside)
     if len(set(tracks.tolist())) == len(tracks) == len(set(detections.tolist())):
-        return Pairs(tracks, detections, distance)  # no choice is left
-    return _best(tracks, detections, distance, np.log(determinant), (n, m))
+        return Pairs(tracks, detections, distance, innovation)  # no choice is left
+    return _best(tracks, detections, distance, np.log(innovation.determinant), (n, m))
 
 
-def _near(positions: Array, covariances: Array, measured: Measurements, gate: float) -> NDArray[np.bool_]:
+def _near(
+    positions: Array, covariances: Array, measured: Measurements, gate: float, allowed: NDArray[np.bool_] | None
+) -> NDArray[np.bool_]:
     """Return the pairs (n, m) that may lie inside the gate: ``d^2 >= |nu|^2 / trace S`` excludes most of the others."""
     if measured.rotations is not None:  # the innovation is not a difference of positions
-        return np.ones((len(positions), len(measured.positions)), dtype=bool)
-    offsets = positions[:, None] - measured.positions
-    squared = np.einsum("nmi,nmi->nm", offsets, offsets)
-    traces = np.einsum("nii->n", covariances)[:, None] + np.einsum("mii->m", measured.noise)
-    near: NDArray[np.bool_] = squared <= gate * traces
-    return near
+        near = np.ones((len(positions), len(measured.positions)), dtype=bool)
+    else:
+        traces = covariances.reshape(len(positions), 9)[:, ::4] @ _ONES
+        noise = measured.noise.reshape(len(measured.noise), 9)[:, ::4] @ _ONES
+        near = squared_distances(positions, measured.positions) <= gate * (traces[:, None] + noise)
+    return near if allowed is None else near & allowed
+
+
+def squared_distances(first: Array, second: Array) -> Array:
+    """Return the squared distances (n, m) of points (n, 3) and (m, 3), at most a rounding error too small."""
+    offsets: Array = first.T[:, :, None] - second.T[:, None]
+    offsets *= offsets
+    return np.asarray(offsets[0] + offsets[1] + offsets[2])
 
 
 def _best(tracks: Indices, detections: Indices, distance: Array, log: Array, shape: tuple[int, int]) -> Pairs:
@@ -109,14 +122,16 @@ def duplicates(measured: Measurements, gate: float) -> list[tuple[int, int]]:
     positions, noise = measured.positions, measured.noise
     if len(positions) < 2:
         return []
-    offsets = positions[:, None] - positions
-    traces = np.einsum("mii->m", noise)
-    squared = np.einsum("nmi,nmi->nm", offsets, offsets)
+    traces = noise.reshape(len(noise), 9)[:, ::4] @ _ONES
+    squared = squared_distances(positions, positions)
+    squared.reshape(-1)[:: len(positions) + 1] = np.inf
+    if squared.min() > 2.0 * gate * traces.max():
+        return []
     close = np.triu(squared <= gate * (traces[:, None] + traces), 1)
     if not close.any():
         return []
     first, second = close.nonzero()
     inverse, _ = inverse_3x3(noise[first] + noise[second])
-    difference = offsets[first, second]
+    difference = positions[first] - positions[second]
     inside = np.einsum("ki,kij,kj->k", difference, inverse, difference) <= gate
     return list(zip(first[inside].tolist(), second[inside].tolist(), strict=True))

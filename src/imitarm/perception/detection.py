@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from imitarm.validation import finite_array, instance, text
 
 Array = NDArray[np.float64]
 
+_FLOOR = 1e-18  # [m^2] smallest variance
 _NEAREST = 1e-3  # [m] depth at which a camera's coordinates are still defined
 
 
@@ -35,6 +35,9 @@ class Detection:
         label: kind of object, for example its colour, if the sensor knows it. Detections with different labels are
             never taken for the same obstacle; an empty label matches every label.
         camera_to_base: pose of the camera that took the measurement. Only the extended Kalman filter uses it.
+        solid: geometry of the obstacle.
+        row: position (3), covariance (9) and size (3) as one row, which a tracker stacks. The variances in it are not
+            smaller than (1 nm)^2, so that two exact detections at the same time stay solvable.
 
     Raises:
         InputError: when the obstacle can't be tracked, the covariance is not symmetric and positive semi-definite, or
@@ -45,6 +48,8 @@ class Detection:
     covariance: Array
     label: str = ""
     camera_to_base: Pose | None = None
+    solid: Solid = field(init=False, repr=False)
+    row: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not isinstance(self.obstacle, Obstacle):
@@ -58,6 +63,11 @@ class Detection:
             raise InputError("Detection: covariance must be symmetric and positive semi-definite [m^2]")
         covariance.setflags(write=False)
         object.__setattr__(self, "covariance", covariance)
+        solid = self.obstacle.solid()
+        size = np.asarray(solid.size, dtype=float)
+        row = np.concatenate([solid.position, (covariance + _FLOOR * np.eye(3)).ravel(), size])
+        object.__setattr__(self, "solid", solid)
+        object.__setattr__(self, "row", row)
         if not text(self.label, "Detection: label").isprintable():
             raise InputError(f"Detection: label must be one line of text, got {self.label!r}")
         if self.camera_to_base is not None:
@@ -69,15 +79,19 @@ class Detection:
                     "the camera's frame (z forward) to the base frame"
                 )
 
-    @cached_property
-    def solid(self) -> Solid:
-        """Geometry of the obstacle."""
-        return self.obstacle.solid()
-
     @property
     def position(self) -> Array:
         """Measured position ``z``: origin of the obstacle's local frame, shape (3,) [m]."""
         return self.solid.position
+
+    def repeats(self, other: Detection) -> bool:
+        """Return whether the other detection has the same shape, pose, covariance and label."""
+        return self is other or (
+            self.solid.kind == other.solid.kind
+            and self.label == other.label
+            and bool((self.row == other.row).all())
+            and bool((self.solid.quaternion == other.solid.quaternion).all())
+        )
 
 
 def resized(obstacle: Obstacle, size: Array) -> Obstacle:

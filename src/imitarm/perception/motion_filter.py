@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -51,6 +50,13 @@ class Belief(NamedTuple):
         """Return the beliefs about some of the obstacles."""
         return Belief(self.mean[rows], self.covariance[rows], self.weights[rows])
 
+    def replaced(self, rows: Indices, other: Belief) -> Belief:
+        """Return these beliefs with others in some rows."""
+        copied = Belief(*(x.copy() for x in self))
+        for array, new in zip(copied, other, strict=True):
+            array[rows] = new
+        return copied
+
     def joined(self, other: Belief) -> Belief:
         """Return these beliefs, followed by others."""
         return Belief(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
@@ -65,8 +71,7 @@ class Belief(NamedTuple):
         return mean, np.einsum("nk,nkij->nij", self.weights, covariance)
 
 
-@dataclass(frozen=True)
-class Measurements:
+class Measurements(NamedTuple):
     """Measured positions of obstacles, one row for each obstacle that was measured.
 
     A measurement is ``z = h(p) + noise``. ``h`` is the position itself, or, with ``rotations``, the camera's
@@ -133,20 +138,63 @@ def _camera_coordinates(points: Array, rotations: Array, origins: Array) -> tupl
     return np.stack([u, v, q[..., 2]], axis=-1), ahead, jacobian @ rotations
 
 
+# entries of a flattened 3x3 matrix: cofactor k is m[A[k]] m[B[k]] - m[C[k]] m[D[k]]
+_A, _B, _C, _D = (
+    np.array([3 * ((j + a) % 3) + (i + b) % 3 for i in range(3) for j in range(3)])
+    for a, b in ((1, 1), (2, 2), (1, 2), (2, 1))
+)
+
+
 def inverse_3x3(matrices: Array) -> tuple[Array, Array]:
-    """Return the inverses (..., 3, 3) and determinants (...) of symmetric matrices (..., 3, 3), by cofactors."""
-    a, b, c = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 0, 2]
-    d, e, f = matrices[..., 1, 1], matrices[..., 1, 2], matrices[..., 2, 2]
-    inverse = np.empty(matrices.shape)
-    inverse[..., 0, 0] = d * f - e * e
-    inverse[..., 0, 1] = inverse[..., 1, 0] = c * e - b * f
-    inverse[..., 0, 2] = inverse[..., 2, 0] = b * e - c * d
-    inverse[..., 1, 1] = a * f - c * c
-    inverse[..., 1, 2] = inverse[..., 2, 1] = b * c - a * e
-    inverse[..., 2, 2] = a * d - b * b
-    determinant = a * inverse[..., 0, 0] + b * inverse[..., 0, 1] + c * inverse[..., 0, 2]
-    inverse /= determinant[..., None, None]
-    return inverse, determinant
+    """Return the inverses (..., 3, 3) and determinants (...) of matrices (..., 3, 3), by cofactors."""
+    flat = matrices.reshape(-1, 9)
+    adjugate = flat.take(_A, axis=1)
+    adjugate *= flat.take(_B, axis=1)
+    adjugate -= flat.take(_C, axis=1) * flat.take(_D, axis=1)
+    determinant = flat[:, 0] * adjugate[:, 0]
+    determinant += flat[:, 1] * adjugate[:, 3]
+    determinant += flat[:, 2] * adjugate[:, 6]
+    adjugate /= determinant[:, None]
+    return adjugate.reshape(matrices.shape), determinant.reshape(matrices.shape[:-2])
+
+
+class Innovation(NamedTuple):
+    """Innovations of k measurements and what follows from them.
+
+    Attributes:
+        value: innovation ``nu``, shape (k, ..., 3).
+        jacobian: ``H``, shape (k, ..., 3, 3); None: the unit matrix.
+        noise: ``R`` in the units of the innovation, shape (k, ..., 3, 3).
+        inverse: inverse of the covariance ``S``, shape (k, ..., 3, 3).
+        determinant: determinant of ``S``, shape (k, ...).
+    """
+
+    value: Array
+    jacobian: Array | None
+    noise: Array
+    inverse: Array
+    determinant: Array
+
+    @classmethod
+    def of(cls, positions: Array, covariances: Array, measured: Measurements) -> Innovation:
+        """Return the innovations of predicted positions (k, ..., 3) with covariances (k, ..., 3, 3)."""
+        value, jacobian, noise = measured.innovation(positions)
+        S = covariances if jacobian is None else jacobian @ covariances @ jacobian.swapaxes(-1, -2)
+        return cls(value, jacobian, noise, *inverse_3x3(S + noise))
+
+    @property
+    def squared(self) -> Array:
+        """Normalised innovations squared ``nu' S^-1 nu``, shape (k, ...)."""
+        with np.errstate(invalid="ignore"):  # behind the camera, the innovation is infinite
+            weighted = (self.value[..., None, :] @ self.inverse)[..., 0, :]
+            weighted *= self.value
+        squared = np.add.reduce(weighted, axis=-1)
+        return np.where(np.isnan(squared), np.inf, squared) if self.jacobian is not None else squared
+
+    def rows(self, rows: Indices) -> Innovation:
+        """Return some of the innovations."""
+        jacobian = None if self.jacobian is None else self.jacobian[rows]
+        return Innovation(self.value[rows], jacobian, self.noise[rows], self.inverse[rows], self.determinant[rows])
 
 
 class MotionFilter:
@@ -181,14 +229,12 @@ class MotionFilter:
         self.initial_speed = finite_number(initial_speed, "ObstacleTracker: initial_speed", "m/s", above=0.0)
         self.size = m = 3 * (max(self.orders) + 1)
         models = len(self.orders)
-        self._first, self._second = np.zeros((models, m, m)), np.zeros((models, m, m))  # F = I + dt F1 + dt^2 F2
-        self._noise = np.zeros((5, models, m, m))  # Q = sum_i dt^(i+1) Q_i
+        self._motion = np.zeros((max(self.orders) + 1, models, m, m))  # F = sum_i dt^i F_i
+        self._noise = np.zeros((2 * max(self.orders) + 1, models, m, m))  # Q = sum_i dt^(i+1) Q_i
         for k, (order, q) in enumerate(zip(self.orders, self.noise, strict=True)):
             self._fill(k, order, q)
-        self._identity = np.eye(m)
-        if max(self.orders) > min(self.orders):  # a model of constant velocity has no acceleration
-            self._identity = np.stack([np.diag((np.arange(m) < 3 * (o + 1)).astype(float)) for o in self.orders])
-        self._select = np.eye(m)
+        self._powers = np.arange(len(self._noise) + 1)
+        self._unit = np.eye(m)
 
     def _fill(self, k: int, order: int, q: float) -> None:
         """Fill in the matrices of model ``k``; entry ``i, j`` of F is ``dt^(j-i) / (j-i)!``."""
@@ -196,10 +242,8 @@ class MotionFilter:
         for i in range(order + 1):
             for j in range(order + 1):
                 block = (k, slice(3 * i, 3 * i + 3), slice(3 * j, 3 * j + 3))
-                if j - i == 1:
-                    self._first[block] = eye
-                elif j - i == 2:
-                    self._second[block] = 0.5 * eye
+                if j >= i:
+                    self._motion[(j - i, *block)] = eye / math.factorial(j - i)
                 left, right = order - i, order - j  # noise enters the highest derivative and is integrated
                 power = left + right + 1
                 factor = q / (math.factorial(left) * math.factorial(right) * power)
@@ -207,15 +251,14 @@ class MotionFilter:
 
     def transition(self, dt: float) -> tuple[Array, Array]:
         """Return ``F`` and ``Q`` of each model over a time ``dt`` [s], shape (M, m, m); Q grows with ``|dt|``."""
-        F = self._identity + dt * self._first
-        if self.size > 6:
-            F += dt * dt * self._second
         ahead = abs(dt)
-        powers = self._noise[: 2 * max(self.orders) + 1]
-        Q = ahead * powers[0]
-        for i in range(1, len(powers)):
-            Q += ahead ** (i + 1) * powers[i]
-        return F, Q if dt >= 0.0 else _mirrored(Q)
+        powers = ahead**self._powers
+        shape = self._motion.shape[1:]
+        Q = (powers[1:] @ self._noise.reshape(len(self._noise), -1)).reshape(shape)
+        if dt < 0.0:
+            powers, Q = dt**self._powers, _mirrored(Q)
+        F = powers[: len(self._motion)] @ self._motion.reshape(len(self._motion), -1)
+        return F.reshape(shape), Q
 
     def born(self, positions: Array, noise: Array) -> Belief:
         """Return the beliefs about new obstacles at measured positions (k, 3) [m] with covariances (k, 3, 3) [m^2]."""
@@ -252,25 +295,47 @@ class MotionFilter:
         covariance += np.einsum("nij,nijk,nijl->njkl", share, spread, spread)
         return Belief(mean, covariance, weights)
 
-    def update(self, belief: Belief, measured: Measurements) -> Belief:
-        """Return the beliefs after one measurement of each obstacle."""
+    def update(self, belief: Belief, measured: Measurements, innovation: Innovation | None = None) -> Belief:
+        """Return the beliefs after one measurement of each obstacle.
+
+        The matrices with 3 rows or columns are padded to the size of the state, because products of small contiguous
+        square matrices are faster than products of parts of larger ones.
+
+        Args:
+            belief: k beliefs.
+            measured: k measurements.
+            innovation: their innovations with the combined moments, if known; used if there is one model.
+        """
         mean, P, weights = belief
-        innovation, jacobian, noise = measured.innovation(mean[..., :3])
-        PHt = P[..., :3] if jacobian is None else P[..., :3] @ jacobian.swapaxes(-1, -2)
-        S = (PHt[..., :3, :] if jacobian is None else jacobian @ PHt[..., :3, :]) + noise
-        inverse, determinant = inverse_3x3(S)
-        K = PHt @ inverse
-        mean = mean + (K @ innovation[..., None])[..., 0]
-        kept = np.repeat(self._select[None], len(mean), axis=0)[:, None] * np.ones((1, P.shape[1], 1, 1))
-        kept[..., :3] -= K if jacobian is None else K @ jacobian
-        P = kept @ P @ kept.swapaxes(-1, -2) + K @ noise @ K.swapaxes(-1, -2)
+        if innovation is None or len(self.orders) > 1:
+            innovation = Innovation.of(mean[..., :3], P[..., :3, :3], measured)
+        else:
+            innovation = Innovation(*(None if x is None else x[:, None] for x in innovation))  # type: ignore[arg-type]
+        inverse, noise = self._padded(innovation.inverse, P), self._padded(innovation.noise, P)
+        if innovation.jacobian is None:
+            K, transposed = P @ inverse, inverse @ P
+            A, A_transposed = self._unit - K, self._unit - transposed
+        else:
+            H = self._padded(innovation.jacobian, P)
+            transposed = inverse @ (H @ P)
+            K = np.ascontiguousarray(transposed.swapaxes(-1, -2))
+            A = self._unit - K @ H
+            A_transposed = np.ascontiguousarray(A.swapaxes(-1, -2))
+        mean = mean + (innovation.value[..., None, :] @ transposed[..., :3, :])[..., 0, :]
+        P = A @ P @ A_transposed
+        P += K @ noise @ transposed
         if len(self.orders) > 1:
-            distance = np.einsum("...i,...ij,...j->...", innovation, inverse, innovation)
-            log = -0.5 * (distance + np.log(determinant))
+            log = -0.5 * (innovation.squared + np.log(innovation.determinant))
             weights = weights * np.exp(log - log.max(axis=1, keepdims=True))
             weights = np.maximum(weights / weights.sum(axis=1, keepdims=True), 1e-6)
             weights /= weights.sum(axis=1, keepdims=True)
         return Belief(mean, P, weights)
+
+    def _padded(self, matrices: Array, like: Array) -> Array:
+        """Return matrices (k, ..., 3, 3) in the upper left corner of zero matrices of the shape of ``like``."""
+        padded = np.zeros(like.shape)
+        padded[..., :3, :3] = matrices
+        return padded
 
 
 def _mirrored(Q: Array) -> Array:

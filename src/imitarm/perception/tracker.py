@@ -23,7 +23,7 @@ from imitarm.validation import finite_number, sequence, whole_number
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-_FLOOR = 1e-18  # [m^2] smallest variance of a detection: two exact ones at the same time stay solvable
+_NO_ROWS = np.zeros((0, 15))
 _RESET = 10.0  # [s] a stamp that goes back by more was given by another clock
 _RECENT = 300  # updates whose innovations are kept
 _FULL_COUNT = 10  # detections after which a size is smoothed with a fixed weight
@@ -216,7 +216,7 @@ class ObstacleTracker:
         return any(
             step.stamp == stamp
             and len(step.detections) == len(detections)
-            and all(_same(a, b) for a, b in zip(step.detections, detections, strict=True))
+            and all(a.repeats(b) for a, b in zip(step.detections, detections, strict=True))
             for step in self._steps
         )
 
@@ -255,13 +255,15 @@ class ObstacleTracker:
     def _advanced(self, tracks: Tracks, stamp: float, detections: tuple[Detection, ...]) -> _Step:
         """Return the tracks after one update."""
         given = detections
+        table = np.array([d.row for d in detections]) if detections else _NO_ROWS
+        measured = self._measurements(detections, table)
         tracks = tracks.at(stamp)
-        measured = self._measurements(detections)
         apart = self._merged(detections, measured)
         if apart is not None:
-            detections, measured = tuple(detections[i] for i in apart.tolist()), measured.rows(apart)
+            detections, table = tuple([detections[i] for i in apart.tolist()]), table[apart]
+            measured = measured.rows(apart)
         pairs = self._assigned(tracks, detections, measured)
-        tracks = self._corrected(tracks, stamp, pairs, detections, measured)
+        tracks = self._corrected(tracks, stamp, pairs, detections, measured, table[:, 12:])
         tracks = self._pruned(tracks)
         if len(pairs.detections) < len(detections):
             left = np.setdiff1d(np.arange(len(detections)), pairs.detections)
@@ -269,12 +271,9 @@ class ObstacleTracker:
             tracks = self._fitted(tracks.joined(born))
         return _Step(stamp, given, self._confirmed(tracks), pairs.distances)
 
-    def _measurements(self, detections: tuple[Detection, ...]) -> Measurements:
-        """Return the detections as arrays."""
-        k = len(detections)
-        positions = np.array([d.solid.position for d in detections]).reshape(k, 3)
-        noise = np.array([d.covariance for d in detections]).reshape(k, 3, 3)
-        noise.reshape(k, 9)[:, ::4] += _FLOOR
+    def _measurements(self, detections: tuple[Detection, ...], table: Array) -> Measurements:
+        """Return the detections, whose rows are ``table`` (k, 15), as measurements."""
+        positions, noise = table[:, :3], table[:, 3:12].reshape(-1, 3, 3)
         if self.motion != "ekf" or all(d.camera_to_base is None for d in detections):
             return Measurements(positions, noise)
         unknown = np.full((3, 3), np.nan)
@@ -304,10 +303,9 @@ class ObstacleTracker:
         allowed = _matching_labels(tracks.labels, [d.label for d in detections])
         mean, covariance = tracks.moments
         mean, covariance = mean[:, :3], covariance[:, :3, :3]
-        old = tracks.ids != UNCONFIRMED
-        if old.all() or not old.any():
+        if tracks.all_confirmed:
             return assign(mean, covariance, measured, self.gate, allowed)
-        pairs = NO_PAIRS
+        old, pairs = tracks.ids != UNCONFIRMED, NO_PAIRS
         free = np.ones(len(detections), dtype=bool)
         for rows in (old.nonzero()[0], (~old).nonzero()[0]):
             columns = free.nonzero()[0]
@@ -316,55 +314,60 @@ class ObstacleTracker:
             found = Pairs(rows[found.tracks], columns[found.detections], found.distances)
             free[found.detections] = False
             pairs = pairs.joined(found)
-        return pairs
+        return pairs.in_order()
 
     def _corrected(
-        self, tracks: Tracks, stamp: float, pairs: Pairs, detections: tuple[Detection, ...], measured: Measurements
+        self,
+        tracks: Tracks,
+        stamp: float,
+        pairs: Pairs,
+        detections: tuple[Detection, ...],
+        measured: Measurements,
+        sizes: Array,
     ) -> Tracks:
-        """Return the tracks after the assigned detections."""
-        hits = tracks.hits << 1 & (1 << self.confirm[1]) - 1
-        rows = pairs.tracks
+        """Return the tracks after the assigned detections, which have these ``sizes`` (m, 3) [m]."""
+        hits, ages = tracks.hits << 1 & (1 << self.confirm[1]) - 1, tracks.ages + 1
+        rows, columns = pairs.tracks, pairs.detections
         if not len(rows):
-            return replace(tracks, hits=hits, ages=tracks.ages + 1)
+            return tracks.changed(hits=hits, ages=ages)
         hits[rows] |= 1
-        belief = self.filter.update(tracks.belief.rows(rows), measured.rows(pairs.detections))
-        belief = belief._replace(mean=self._capped(belief.mean))
-        mean, covariance, weights = (old.copy() for old in tracks.belief)
-        mean[rows], covariance[rows], weights[rows] = belief
-        last_seen, sizes, counts = tracks.last_seen.copy(), tracks.sizes.copy(), tracks.counts.copy()
+        every = len(rows) == len(tracks)  # then the rows are in order
+        before = tracks.belief if every else tracks.belief.rows(rows)
+        belief = self.filter.update(before, measured.rows(columns), pairs.innovation)
+        self._cap(belief.mean)
+        last_seen, counts = tracks.last_seen.copy(), tracks.counts.copy()
         last_seen[rows] = stamp
         seen, labels = list(tracks.detections), list(tracks.labels)
-        for row, index in zip(rows.tolist(), pairs.detections.tolist(), strict=True):
+        for row, index in zip(rows.tolist(), columns.tolist(), strict=True):
             detection = detections[index]
-            counts[row] = counts[row] + 1 if detection.solid.kind == seen[row].solid.kind else 1
-            seen[row], labels[row] = detection, detection.label or labels[row]
-        measured_sizes = np.array([detections[i].solid.size for i in pairs.detections.tolist()])
-        weight = np.where(counts[rows] == 1, 1.0, 1.0 / np.minimum(counts[rows], _FULL_COUNT))
-        sizes[rows] += weight[:, None] * (measured_sizes - sizes[rows])
-        return replace(
-            tracks,
-            belief=type(belief)(mean, covariance, weights),
+            if detection.solid.kind != seen[row].solid.kind:
+                counts[row] = 0
+            seen[row] = detection
+            labels[row] = detection.label or labels[row]
+        counts[rows] += 1
+        return tracks.changed(
+            belief=belief if every else tracks.belief.replaced(rows, belief),
             hits=hits,
-            ages=tracks.ages + 1,
+            ages=ages,
             last_seen=last_seen,
-            sizes=sizes,
+            sizes=_smoothed(tracks.sizes, rows, sizes[columns], counts),
             counts=counts,
             detections=tuple(seen),
             labels=tuple(labels),
         )
 
-    def _capped(self, mean: Array) -> Array:
-        """Return the states (..., m) with speeds of at most ``max_speed``."""
+    def _cap(self, mean: Array) -> None:
+        """Scale down speeds above ``max_speed`` in the states (..., m)."""
         velocity = mean[..., 3:6]
-        squared = np.einsum("...i,...i->...", velocity, velocity)
-        if (squared > self.max_speed**2).any():
-            scale = self.max_speed / np.sqrt(np.maximum(squared, self.max_speed**2))
-            mean[..., 3:6] = velocity * scale[..., None]
-        return mean
+        squared = np.add.reduce(velocity * velocity, axis=-1)
+        if squared.max() > self.max_speed**2:
+            velocity *= (self.max_speed / np.sqrt(np.maximum(squared, self.max_speed**2)))[..., None]
 
     def _pruned(self, tracks: Tracks) -> Tracks:
         """Return the tracks without those that have ended."""
         needed, window = self.confirm
+        if tracks.all_confirmed and len(tracks) and tracks.stamp - tracks.last_seen.min() <= self.max_unseen:
+            return tracks
         alive = tracks.stamp - tracks.last_seen <= self.max_unseen + 1e-9
         missed = np.bitwise_count(tracks.hits) < needed
         alive &= (tracks.ids != UNCONFIRMED) | (tracks.ages < window) | ~missed
@@ -399,13 +402,25 @@ class ObstacleTracker:
 
     def _confirmed(self, tracks: Tracks) -> Tracks:
         """Return the tracks with numbers for those that have been detected often enough."""
+        if tracks.all_confirmed:
+            return tracks
         new = (tracks.ids == UNCONFIRMED) & (np.bitwise_count(tracks.hits) >= self.confirm[0])
         if not new.any():
             return tracks
         ids = tracks.ids.copy()
         count = int(new.sum())
         ids[new] = tracks.next_id + np.arange(count)
-        return replace(tracks, ids=ids, next_id=tracks.next_id + count)
+        return tracks.changed(ids=ids, next_id=tracks.next_id + count)
+
+
+def _smoothed(sizes: Array, rows: Indices, measured: Array, counts: NDArray[np.int64]) -> Array:
+    """Return the sizes (n, 3) after new measurements (k, 3) of the tracks ``rows``, the mean of the last ones."""
+    error = measured - sizes[rows]
+    if not error.any():
+        return sizes
+    smoothed = sizes.copy()
+    smoothed[rows] += error / np.minimum(counts[rows], _FULL_COUNT)[:, None]
+    return smoothed
 
 
 def _checked_confirm(confirm: object) -> tuple[int, int]:
@@ -413,17 +428,6 @@ def _checked_confirm(confirm: object) -> tuple[int, int]:
         raise InputError(f"ObstacleTracker: confirm must be two numbers (hits, updates), got {confirm!r}")
     updates = whole_number(confirm[1], "ObstacleTracker: updates of confirm", at_least=1, at_most=32)
     return whole_number(confirm[0], "ObstacleTracker: hits of confirm", at_least=1, at_most=updates), updates
-
-
-def _same(a: Detection, b: Detection) -> bool:
-    """Whether two detections are copies of each other."""
-    return a is b or (
-        a.solid.kind == b.solid.kind
-        and a.label == b.label
-        and bool((a.position == b.position).all())
-        and bool((a.solid.quaternion == b.solid.quaternion).all())
-        and bool((a.covariance == b.covariance).all())
-    )
 
 
 def _accuracy(detection: Detection) -> tuple[float, ...]:
