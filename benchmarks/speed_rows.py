@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 import arm_rows
 import ik_rows
 import retarget_rows
+import tracking_rows
 import transmission_rows
 from imitarm.benchmark import avoidance, families
 from imitarm.skills import DMP, GMR, GaussianMixture
@@ -317,6 +318,7 @@ ROWS: tuple[Callable[[], Row], ...] = (
     *arm_rows.ROWS,
     *ik_rows.ROWS,
     *retarget_rows.ROWS,
+    *tracking_rows.ROWS,
     *transmission_rows.ROWS,
     importing,
 )

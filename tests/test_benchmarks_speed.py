@@ -18,6 +18,7 @@ import retarget_rows
 import speed
 import speed_rows
 import timing
+import tracking_rows
 import transmission_rows
 from imitarm.transmission.latency import LatencyLog
 from speed import run, show, show_changes
@@ -193,7 +194,9 @@ def test_a_checkout_that_can_not_be_loaded_is_reported(tmp_path: Path) -> None:
 
 def test_every_row_is_run_says_what_it_does_and_has_a_name_of_its_own() -> None:
     rows = speed_rows.ROWS
-    assert {*arm_rows.ROWS, *ik_rows.ROWS, *retarget_rows.ROWS, *transmission_rows.ROWS} <= set(rows)
+    assert {*arm_rows.ROWS, *ik_rows.ROWS, *retarget_rows.ROWS, *tracking_rows.ROWS, *transmission_rows.ROWS} <= set(
+        rows
+    )
     assert all(make.__doc__ for make in rows)
     assert len({make.__name__ for make in rows}) == len(rows)
 
