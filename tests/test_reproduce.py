@@ -108,8 +108,8 @@ def test_out_of_time_the_robot_stops_and_the_reason_is_told():
 
 
 def test_what_is_touched_is_named_and_a_held_robot_gives_up():
-    robot = robot_with(wall(0.04))
-    rollout = reproduce(Glide([0.3, 0.0, 0.0]), robot, lambda t: robot.scene, safety=SafetyFilter(ARM, clearance=None))
+    robot, blind = robot_with(wall(0.04)), SafetyFilter(ARM, clearance=None)
+    rollout = reproduce(Glide([0.3, 0.0, 0.0]), robot, lambda t: robot.scene, safety=blind, contact=False)
     assert not rollout.success
     assert "protective stop" in rollout.reason
     assert 'with box "wall"' in rollout.reason
@@ -154,6 +154,10 @@ def test_by_default_nothing_is_touched_whatever_the_policy_wants():
     rollout = reproduce(Glide([0.3, 0.0, 0.0]), robot, lambda t: robot.scene, timeout=3.0)
     assert not rollout.details["contacts"] and rollout.min_clearance > 0.0
     assert rollout.details["filtered"] > 50
+    found = rollout.details["interventions"]
+    assert sum(one.count for one in found) > 50 and {one.other for one in found} == {'box "wall"'}
+    assert all(0.0 < one.first <= one.last <= 3.1 for one in found)
+    assert f'mostly between {found[0].link} and box "wall"' in rollout.reason
 
 
 def test_a_motion_nearer_than_the_filter_requires_is_no_success():

@@ -11,6 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.command import Command, Status
+from imitarm.control_loop.contact import Contact, ContactDetector
+from imitarm.control_loop.interventions import InterventionLog
+from imitarm.control_loop.watchdog import Watchdog
 from imitarm.errors import InfeasibleError, InputError
 from imitarm.kinematics.arm import ArmState
 from imitarm.kinematics.pose import Pose
@@ -19,7 +22,7 @@ from imitarm.robots.robot import Robot
 from imitarm.safety import SafetyFilter, SafetyStep
 from imitarm.scene import Scene
 from imitarm.trajectory import Rollout, Trajectory
-from imitarm.validation import finite_number
+from imitarm.validation import finite_number, flag, instance
 
 Array = NDArray[np.float64]
 
@@ -33,7 +36,7 @@ class Step:
         tool_to_base: measured pose of the tool after the step.
         state: measured state of the arm after the step.
         scene: the observed scene.
-        command: the policy's command.
+        command: the policy's command, or what the watchdog left of it.
         safety: result of the safety filter for this command.
         clearance: measured distance from arm and tool to the nearest obstacle [m].
     """
@@ -55,6 +58,8 @@ def reproduce(
     dt: float = 0.01,
     timeout: float = 60.0,
     safety: SafetyFilter | None = None,
+    watchdog: Watchdog | None = None,
+    contact: ContactDetector | bool = True,
     on_step: Callable[[Step], None] | None = None,
 ) -> Rollout:
     """Let ``policy`` reproduce its skill on ``robot``, and record what happens.
@@ -63,7 +68,8 @@ def reproduce(
     :class:`~imitarm.command.Command`. The :class:`~imitarm.safety.SafetyFilter` converts the command to joint
     velocities that keep the arm's limits and clearances, and the robot moves. A new opening in the command moves the
     fingers of the gripper. The motion ends when the policy has finished, when the robot has stopped to protect itself,
-    or at ``timeout``. The robot is always braked to a stop, also after an exception.
+    when the torques of the joints show a contact, or at ``timeout``. The robot is always braked to a stop, also after
+    an exception.
 
     Args:
         policy: policy that decides the motion; its ``reset`` is called first.
@@ -74,6 +80,11 @@ def reproduce(
         timeout: longest duration [s].
         safety: safety filter; None: a filter that keeps the arm within its joint limits, its links at least 10 mm apart
             and the whole arm out of contact with obstacles. The filter's ``dt`` must equal this ``dt``.
+        watchdog: slows the arm down and stops it while no new scenes arrive; None: a
+            :class:`~imitarm.control_loop.watchdog.Watchdog` with its default times.
+        contact: detects contacts from the torques of the joints; True: a
+            :class:`~imitarm.control_loop.contact.ContactDetector` with its default thresholds, if the masses of the arm
+            are known; False: contacts are not detected.
         on_step: function called after each step, for progress or drawing; if the function raises an exception, the
             robot is stopped and the exception is raised again.
 
@@ -82,9 +93,12 @@ def reproduce(
         nothing, and kept the clearance that the filter requires. Its ``details`` contain the commanded ``"twists"``
         (n, 6) and several counts. The count ``"clamped"`` says how often each limit changed a command. The count
         ``"filtered"`` is the number of steps in which the filter changed a command to keep a clearance, and
-        ``"unsafe"`` is the number of steps without a safe motion. The count ``"statuses"`` is the number of steps with
-        each status of the policy. The details also contain the entries of the robot's
-        :meth:`~imitarm.robots.robot.Robot.report`.
+        ``"unsafe"`` is the number of steps without a safe motion. ``"interventions"`` is a tuple of
+        :class:`~imitarm.control_loop.interventions.Intervention`, with the names of the parts that came near each
+        other, and ``"contact"`` the detected :class:`~imitarm.control_loop.contact.Contact` or None. The count
+        ``"statuses"`` is the number of steps with each status of the policy. The details also contain the entries of
+        the robot's :meth:`~imitarm.robots.robot.Robot.report`. The attribute ``reason`` names contacts and what the
+        safety filter did.
 
     Raises:
         InputError: when ``dt`` or ``timeout`` is not positive, or the policy does not return a Command.
@@ -99,6 +113,9 @@ def reproduce(
         raise InputError(
             f"reproduce: the safety filter was made for dt {keeper.dt:g} s, not {dt:g} s; make it with the same dt"
         )
+    watch = Watchdog() if watchdog is None else instance(watchdog, Watchdog, "reproduce: watchdog")
+    watch.reset()
+    detector, touch = _detector(robot, contact), None
     log = _Log(robot)
     if log.clearances[0] <= 0.0:
         raise InfeasibleError(f"the arm starts in contact ({_nearest(robot)}): move the obstacle, or start elsewhere")
@@ -116,19 +133,32 @@ def reproduce(
             if last.opening is not None and last.opening != opening:
                 opening = last.opening
                 robot.grasp(opening)
+            last = watch.guard(last, observation.scene.stamp, k * dt)
             scene = observation.scene.now(k * dt)
             kept = keeper.step(last, robot.set_point, robot.velocity, scene)
             robot.move(kept.velocity, dt)
             step = log.take(robot, scene, last, kept)
             if on_step is not None:
                 on_step(step)
-            if robot.fault:
+            touch = None if detector is None else detector.update(step.state)
+            if robot.fault or touch is not None:
                 break
     finally:
         robot.stop(dt)
     log.take(robot, observation.scene, Command(np.zeros(6)), None)
-    fault = robot.fault or ("" if finished else _unfinished(timeout, last, robot))
+    log.contact = touch
+    fault = robot.fault or str(touch or "") or ("" if finished else _unfinished(timeout, last, robot))
     return log.rollout(robot, fault, keeper.clearance)
+
+
+def _detector(robot: Robot, contact: ContactDetector | bool) -> ContactDetector | None:
+    """Return the detector of contacts for one motion; None if there is none."""
+    if isinstance(contact, ContactDetector):
+        contact.reset()
+        return contact
+    if flag(contact, "reproduce: contact") and robot.arm.has_dynamics:
+        return ContactDetector(robot.arm)
+    return None
 
 
 def _unfinished(timeout: float, last: Command, robot: Robot) -> str:
@@ -158,6 +188,8 @@ class _Log:
     twists: list[Array] = field(default_factory=list)
     clamped: Counter[str] = field(default_factory=Counter)
     statuses: Counter[str] = field(default_factory=Counter)
+    interventions: InterventionLog = field(default_factory=InterventionLog)
+    contact: Contact | None = None
     filtered: int = 0
     unsafe: int = 0
 
@@ -188,6 +220,7 @@ class _Log:
             self.statuses[command.status.value] += 1
             self.filtered += safety.changed > 0.0
             self.unsafe += not safety.safe
+            self.interventions.take(state.time - self.begin, safety)
         return Step(state.time - self.begin, pose, state, scene, command, safety, clearance)
 
     def rollout(self, robot: Robot, fault: str, required: float | None) -> Rollout:
@@ -208,6 +241,8 @@ class _Log:
             "clamped": dict(self.clamped),
             "filtered": self.filtered,
             "unsafe": self.unsafe,
+            "interventions": self.interventions.result(),
+            "contact": self.contact,
             "statuses": dict(self.statuses),
             **report,
         }
@@ -218,6 +253,6 @@ class _Log:
             torques=np.array([state.torque for state in self.states]),
             clearance=np.array(self.clearances),
             success=not fault,
-            reason=fault or "finished",
+            reason="; ".join(filter(None, [fault or "finished", self.interventions.sentence()])),
             details=details,
         )

@@ -1,0 +1,70 @@
+"""The record of what the safety filter changed during a motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from imitarm.safety import SafetyStep
+
+
+@dataclass(frozen=True)
+class Intervention:
+    """All control steps in which the safety filter changed the command because of the same two parts.
+
+    Attributes:
+        link: name of the part of the arm.
+        other: name of the obstacle, or of another link.
+        count: number of steps.
+        first: time of the first one [s].
+        last: time of the last one [s].
+        room: smallest distance minus the required clearance in these steps [m].
+        unsafe: number of these steps in which no safe motion existed.
+    """
+
+    link: str
+    other: str
+    count: int
+    first: float
+    last: float
+    room: float
+    unsafe: int = 0
+
+
+@dataclass
+class InterventionLog:
+    """Collects the interventions of a motion."""
+
+    _found: dict[tuple[str, str], Intervention] = field(default_factory=dict)
+
+    def take(self, time: float, step: SafetyStep) -> None:
+        """Add one control step at ``time`` [s]."""
+        cause = step.cause
+        if cause is None:
+            return
+        known = self._found.get(cause[:2])
+        before = known or Intervention(*cause[:2], 0, time, time, cause.room)
+        self._found[cause[:2]] = Intervention(
+            *cause[:2],
+            before.count + 1,
+            before.first,
+            time,
+            min(before.room, cause.room),
+            before.unsafe + (not step.safe),
+        )
+
+    def result(self) -> tuple[Intervention, ...]:
+        """Return the interventions, those of most steps first."""
+        return tuple(sorted(self._found.values(), key=lambda found: -found.count))
+
+    def sentence(self) -> str:
+        """Return what the filter did in one sentence; empty if it did nothing."""
+        found = self.result()
+        if not found:
+            return ""
+        count, unsafe = sum(one.count for one in found), sum(one.unsafe for one in found)
+        first, last = min(one.first for one in found), max(one.last for one in found)
+        sentence = (
+            f"the safety filter intervened in {count} steps, {first:.2f} to {last:.2f} s, "
+            f"mostly between {found[0].link} and {found[0].other}"
+        )
+        return f"{sentence}; no safe motion in {unsafe} of them" if unsafe else sentence

@@ -1,0 +1,72 @@
+"""Watchdog of the sensor: without new scenes, the arm slows down and then stops."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from imitarm.command import Command, Status
+from imitarm.errors import InputError
+from imitarm.validation import finite_number, flag
+
+
+class Watchdog:
+    r"""Slows the arm down and stops it while the sensor is frozen or silent.
+
+    The ``stamp`` of a scene is the time at which it was seen. If no scene with a later stamp has arrived for the time
+    a, the command is multiplied by
+
+    .. math:: f(a) = \min\Big(1,\; \max\Big(0,\; \frac{a_{stop} - a}{a_{stop} - a_{slow}}\Big)\Big) .
+
+    The arm moves again when a scene with a later stamp arrives. A scene whose stamp has never changed counts as a scene
+    in which nothing moves, and does not stop the arm, unless ``from_start`` is set.
+
+    Args:
+        slow_after: a_slow, age of the newest scene at which the arm begins to slow down [s]. Choose at least twice the
+            time between two scenes.
+        stop_after: a_stop, age at which it stands [s].
+        from_start: whether new scenes are expected from the beginning.
+
+    Raises:
+        InputError: when the times are not positive, or ``stop_after`` is not later than ``slow_after``.
+    """
+
+    def __init__(self, slow_after: float = 0.2, stop_after: float = 0.5, *, from_start: bool = False) -> None:
+        self.slow_after = finite_number(slow_after, "Watchdog: slow_after", "s", above=0.0)
+        self.stop_after = finite_number(stop_after, "Watchdog: stop_after", "s", above=0.0)
+        if self.stop_after <= self.slow_after:
+            raise InputError(f"Watchdog: needs slow_after < stop_after [s], got {slow_after!r} and {stop_after!r}")
+        self.from_start = flag(from_start, "Watchdog: from_start")
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all scenes."""
+        self._newest, self._since = -math.inf, 0.0
+        self._alive = self.from_start
+
+    def guard(self, command: Command, stamp: float, time: float) -> Command:
+        """Return the command, slowed down if no new scene has arrived for too long.
+
+        Args:
+            command: command of the policy.
+            stamp: stamp of the latest scene [s].
+            time: current time [s].
+        """
+        if stamp > self._newest:
+            self._alive |= self._newest > -math.inf
+            self._newest, self._since = stamp, time
+        age = time - self._since
+        if not self._alive or age <= self.slow_after:
+            return command
+        factor = max(0.0, (self.stop_after - age) / (self.stop_after - self.slow_after))
+        slowed = f"slowed down to {100.0 * factor:.0f} %" if factor else "stopped"
+        velocity = command.joint_velocity
+        return replace(
+            command,
+            twist=factor * command.twist,
+            joint_velocity=None if velocity is None else factor * velocity,
+            posture=command.posture if factor else None,
+            elbow=command.elbow if factor else None,
+            status=Status.BRAKING,
+            reason=f"no new scene for {age:.2f} s: {slowed}",
+        )
