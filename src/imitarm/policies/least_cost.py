@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 _UP = np.array([0.0, 0.0, 1.0])
-_TIED = 1e-9  # costs that differ by less are equal
+_TIED = 1e-13  # costs that differ by less are equal: it is above the rounding of symmetric scenes
 
 
 class Response(NamedTuple):

@@ -170,8 +170,9 @@ class GaussianCost(ObstacleCost):
     of the predicted position. The mean over P is the closed form of the sample mean in thesis Eq 5.5, whose exponent
     lacks its minus sign.
 
-    The height ``alpha = k l^2 e^2`` (with l the least of the lengths and k the stiffness of the task's cost) makes the
-    push at the distance 2 l, which is the required clearance, hold a deviation of 2 l against the task's cost.
+    The height is ``alpha = 2 k l^2 e^2``, with the least of the lengths l and the task's cost ``k |e|^2 / 2`` of a
+    deviation e during the whole horizon. At the required clearance, which is the distance 2 l, the cost of one instant
+    is then that of a deviation of 2 l, which leads around the obstacle, during the whole horizon.
 
     Attributes:
         stiffness: k [1/m^2].
@@ -194,7 +195,7 @@ class GaussianCost(ObstacleCost):
         rotation = quaternion_to_matrix(packed.quaternions[i])
         shape = (rotation * (lengths**2)[:, None, :]) @ np.swapaxes(rotation, -1, -2)
         spread = shape + packed.covariances[i]
-        height = self.stiffness * lengths.min(axis=1) ** 2 * np.e**2
+        height = 2.0 * self.stiffness * lengths.min(axis=1) ** 2 * np.e**2
         height = height * np.prod(lengths, axis=1) / np.sqrt(np.linalg.det(spread))
         return height, np.asarray(np.linalg.inv(spread), dtype=float)
 

@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 
 N_SAMPLES = 600  # intervals of the tables
 _FLOOR = 5e-3  # [m] standard deviation that is added to the learned one
+_SOFTEST, _STIFFEST = 0.25, 4.0  # limits of the precision
+_UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,18 +28,12 @@ class PrimitivePath:
     The motion depends on the goal g linearly: if the goal moves by delta, the motion moves by ``p(s) delta``, with the
     fraction p of the path that has been travelled. A moving goal therefore costs no new integration.
 
-    The precision is the inverse of the learned covariance, without its scale (thesis Eq 5.1, the matrix theta):
-
-    .. math:: \Theta(s) = \bar\sigma^2 (\Sigma(s) + \epsilon^2 I)^{-1}, \qquad \epsilon = 5\ mm
-
-    The factor makes the mean of ``trace(Theta) / 3`` over the path equal to 1.
-
     Attributes:
         duration: duration of the motion [s].
         goal: tool_to_base at the end of the motion.
         positions: xi at n + 1 equally spaced phases, shape (n + 1, 3) [m].
         progress: p, shape (n + 1,).
-        precision: Theta, shape (n + 1, 3, 3).
+        precision: Theta of :func:`learned_precision`, shape (n + 1, 3, 3).
         quaternions: learned rotations wxyz, shape (n + 1, 4); None when no rotation was learned.
     """
 
@@ -51,31 +47,22 @@ class PrimitivePath:
     quaternions: Array | None
 
     @classmethod
-    def of(cls, skill: Skill, dmp: DMP, start: Pose | None = None, goal: Pose | None = None) -> Self:
+    def of(cls, dmp: DMP, precision: Array, start: Pose | None = None, goal: Pose | None = None) -> Self:
         """Return the motion between two poses.
 
         Args:
-            skill: the skill whose covariance is the tolerance.
-            dmp: primitive that was trained on the skill's nominal path.
+            dmp: the primitive.
+            precision: Theta, shape (n + 1, 3, 3).
             start: pose of the tool at the start; None: as learned.
             goal: pose of the tool at the end; None: as learned.
         """
         T = dmp.duration_
-        times = np.linspace(0.0, T, N_SAMPLES + 1)
         motion = dmp.generate(start, goal, dt=T / N_SAMPLES)
-        covariance = skill.tolerance(times) + _FLOOR**2 * np.eye(3)
-        precision = np.asarray(np.linalg.inv(covariance), dtype=float)
-        precision *= 3.0 / float(np.trace(precision, axis1=1, axis2=2).mean())
-        return cls(
-            dmp,
-            start,
-            T,
-            skill.goal_ if goal is None else goal,
-            motion.positions,
-            dmp.progress(times),
-            precision,
-            motion.quaternions,
-        )
+        if goal is None:
+            rotation = _UPRIGHT if dmp.orientation_ is None else dmp.orientation_.goal_
+            goal = Pose(dmp.goal_, rotation)
+        progress = dmp.progress(np.linspace(0.0, T, N_SAMPLES + 1))
+        return cls(dmp, start, T, goal, motion.positions, progress, precision, motion.quaternions)
 
     def to(self, goal: Pose) -> PrimitivePath:
         """Return the motion to another goal."""
@@ -135,3 +122,19 @@ class PrimitivePath:
     def rotations(self) -> Array | None:
         """Learned rotations as matrices, shape (n + 1, 3, 3); None when no rotation was learned."""
         return None if self.quaternions is None else quaternion_to_matrix(self.quaternions)
+
+
+def learned_precision(skill: Skill) -> Array:
+    r"""Return how precise the motion must be, at n + 1 equally spaced phases, shape (n + 1, 3, 3).
+
+    This is the matrix theta of thesis Eq 5.1: the inverse of the learned covariance, without its scale.
+
+    .. math:: \Theta(s) = \bar\sigma^2 (\Sigma(s) + \epsilon^2 I)^{-1}, \qquad \epsilon = 5\ mm
+
+    The factor is the mean variance of the motion, so a typical precision is 1. The eigenvalues are limited to 1/4 to 4:
+    no precision of the teacher is worth a collision.
+    """
+    covariance = skill.tolerance(np.linspace(0.0, skill.duration_, N_SAMPLES + 1)) + _FLOOR**2 * np.eye(3)
+    variances, axes = np.linalg.eigh(covariance)
+    precision = np.clip(variances.mean() / variances, _SOFTEST, _STIFFEST)
+    return np.asarray((axes * precision[:, None]) @ np.swapaxes(axes, 1, 2))

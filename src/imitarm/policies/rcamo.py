@@ -21,7 +21,7 @@ from imitarm.perception.margins import CoverageMargin
 from imitarm.policies.least_cost import STAY, Choice, LeastCost, Prediction, Response, allowed_axes, frame, headings
 from imitarm.policies.obstacle_cost import DistanceCost, GaussianCost, ObstacleCost, PredictedObstacles
 from imitarm.policies.policy import Observation, Policy
-from imitarm.policies.primitive_path import PrimitivePath
+from imitarm.policies.primitive_path import PrimitivePath, learned_precision
 from imitarm.scene.distances import distances
 from imitarm.skills.dmp import DMP
 from imitarm.skills.dynamical_systems import Gains
@@ -120,9 +120,10 @@ class RCAMO(Policy):
         response = Response.of(self.gains, self._tau, self._times)
         obstacle_cost: ObstacleCost = DistanceCost(self.clearance, spheres[:, 3])
         if cost == "gaussian":
-            obstacle_cost = GaussianCost(self.clearance, spheres[:, 3], stiffness=LeastCost.deviation_weight)
+            whole = LeastCost.deviation_weight * float(np.sum(LeastCost.discount ** np.arange(1.0, steps + 1.0)))
+            obstacle_cost = GaussianCost(self.clearance, spheres[:, 3], stiffness=whole)
         self.least_cost = LeastCost(response, obstacle_cost, limit, headings(self._axes))
-        self._dmp = _primitive(skill, self.gains)
+        self._dmp, self._precision = _primitive(skill, self.gains), learned_precision(skill)
         self._steps: dict[float, Response] = {}
         self._path: PrimitivePath | None = None
 
@@ -134,7 +135,7 @@ class RCAMO(Policy):
         if not self.skill.gmr_.has_orientation_:
             away = away[:3]
         start = None if np.linalg.norm(away) <= _SAME_PLACE else observation.tool_to_base
-        self._path = PrimitivePath.of(self.skill, self._dmp, start, observation.scene.goal)
+        self._path = PrimitivePath.of(self._dmp, self._precision, start, observation.scene.goal)
         self._begin(observation, 0.0)
 
     def resume(self, observation: Observation, phase: float) -> None:
@@ -145,7 +146,7 @@ class RCAMO(Policy):
         phase = finite_number(phase, "RCAMO.resume: phase", at_least=0.0, at_most=1.0)
         instance(observation, Observation, "RCAMO.resume: observation")
         if self._path is None:
-            self._path = PrimitivePath.of(self.skill, self._dmp, None, observation.scene.goal)
+            self._path = PrimitivePath.of(self._dmp, self._precision, None, observation.scene.goal)
         self._begin(observation, phase)
 
     def _begin(self, observation: Observation, phase: float) -> None:
