@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 _UP = np.array([0.0, 0.0, 1.0])
+_TOUCHES = 1e-6  # [m] of the clearance at the goal
 _TIED = 1e-13  # costs that differ by less are equal: it is above the rounding of symmetric scenes
 
 
@@ -143,11 +144,15 @@ class Prediction(NamedTuple):
         centers: centres of the tool's spheres without coupling, shape (R, H, S, 3) [m].
         free: deviations without coupling, shape (H, 3) [m].
         precision: Theta, shape (R, H, 3, 3).
+        arrived: whether the phase is at its end, shape (R, H).
+        goal: centres of the tool's spheres at the goal, shape (S, 3) [m].
     """
 
     centers: Array
     free: Array
     precision: Array
+    arrived: NDArray[np.bool_]
+    goal: Array
 
 
 class Choice(NamedTuple):
@@ -188,8 +193,13 @@ class LeastCost:
     less than its cost without the obstacles, and an obstacle that the tool can't reach until an instant costs nothing
     there.
 
+    The cost of an obstacle falls gradually, so an obstacle beside the goal would keep the tool away from the goal.
+    After the phase has ended, b is therefore reduced by its value at the goal, if the goal keeps the clearance.
+
     Attributes:
-        response: deviation at the instants of the horizon.
+        times: instants of the horizon, shape (H,) [s].
+        gains: stiffness and damping of the deviation.
+        time_constant: tau of the deviation [s].
         obstacle_cost: b.
         max_acceleration: a_max [m/s^2].
         units: headings in the frame of :func:`frame`, shape (k, d).
@@ -202,7 +212,9 @@ class LeastCost:
         sizes: sizes of u, as fractions of a_max.
     """
 
-    response: Response
+    times: Array
+    gains: Gains
+    time_constant: float
     obstacle_cost: ObstacleCost
     max_acceleration: float
     units: Array
@@ -213,6 +225,11 @@ class LeastCost:
     wait_weight: float = 2.0
     rates: tuple[float, ...] = (1.0, 0.5, 0.0, -0.5)
     sizes: tuple[float, ...] = (0.35, 0.7, 1.0)
+
+    @cached_property
+    def response(self) -> Response:
+        """Deviation at the instants of the horizon."""
+        return Response.of(self.gains, self.time_constant, self.times)
 
     @cached_property
     def _weights(self) -> Array:
@@ -284,7 +301,7 @@ class LeastCost:
         scaled, sizes = self._candidates
         scaled = scaled @ axes.T
         if len(one_sided):
-            allowed = (scaled @ one_sided.T <= _TIED).all(axis=1)
+            allowed = (scaled @ one_sided.T <= 1e-9).all(axis=1)
             scaled, sizes = scaled[allowed], sizes[allowed]
         best: Choice | None = None
         for begin, end in ((0, 1), (1, len(self.rates))):
@@ -313,14 +330,18 @@ class LeastCost:
         free_gaps = gaps.reshape(shape)
         costs = np.full((n_rates, len(scaled)), math.inf)
         values = self.obstacle_cost.values(obstacles, every.groups, *still, gaps).reshape(shape)
-        free = np.add.reduce(values[..., 0] if S == 1 else values.max(axis=3), axis=1) @ self._weights
+        values = values[..., 0] if S == 1 else values.max(axis=3)
+        reduction = self._reduction(prediction, obstacles)
+        if reduction is not None:
+            values = np.maximum(values - reduction, 0.0)
+        free = np.add.reduce(values, axis=1) @ self._weights
         costs[:, 0] = smooth[:, 0] + free
         least = min(bound, float(costs[:, 0].min()))
         columns = (smooth.min(axis=0) <= least + _TIED).nonzero()[0]
         columns = columns[columns > 0]
         found: _Evaluated | None = None
         if len(columns):
-            found = self._evaluate(scaled[columns], prediction, obstacles, free_gaps)
+            found = self._evaluate(scaled[columns], prediction, obstacles, free_gaps, reduction)
             costs[:, columns] = smooth[:, columns] + found.costs
         rate, index = _first_of_best(costs, scaled)
         cost = float(costs[rate, index])
@@ -332,8 +353,25 @@ class LeastCost:
             return rate, index, cost, nearest, float(each[nearest])
         return rate, index, cost, *found.nearest(rate, int(np.searchsorted(columns, index)))
 
+    def _reduction(self, prediction: Prediction, obstacles: PredictedObstacles) -> Array | None:
+        """Return by how much the costs of obstacles are reduced at the end, shape (R, n, H); None before the end."""
+        if not prediction.arrived.any():
+            return None
+        n, H, S = len(obstacles.packed), len(self.times), len(prediction.goal)
+        groups = _Pairs.all(1, n, H, S).groups
+        still = prediction.goal[groups.sphere], np.zeros(n * H * S), np.zeros((1, 3))
+        gaps = self.obstacle_cost.gaps(obstacles, groups, *still)
+        values = self.obstacle_cost.values(obstacles, groups, *still, gaps).reshape(n, H, S).max(axis=2)
+        keeps = gaps.reshape(n, H, S).min(axis=2) >= self.obstacle_cost.clearance - _TOUCHES
+        return np.where(prediction.arrived[:, None] & keeps, values, 0.0)
+
     def _evaluate(
-        self, scaled: Array, prediction: Prediction, obstacles: PredictedObstacles, free_gaps: Array
+        self,
+        scaled: Array,
+        prediction: Prediction,
+        obstacles: PredictedObstacles,
+        free_gaps: Array,
+        reduction: Array | None,
     ) -> _Evaluated:
         """Return the costs of candidates (C, 3), with those pairs only that any candidate can bring near each other."""
         gains, S = self._gains[:, None], free_gaps.shape[3]
@@ -345,12 +383,13 @@ class LeastCost:
         moved = prediction.centers.reshape(-1, 3)[pairs.center], self._gains[groups.instant], scaled
         gaps = self.obstacle_cost.gaps(obstacles, groups, *moved)
         values = self.obstacle_cost.values(obstacles, groups, *moved, gaps)
+        key, instant = pairs.key, groups.instant
         if S > 1 and len(rate):
-            first = np.flatnonzero(np.diff(pairs.key, prepend=-1))
+            first = np.flatnonzero(np.diff(key, prepend=-1))
             values = np.maximum.reduceat(values, first, axis=0)
-            rate, instant = rate[first], groups.instant[first]
-        else:
-            instant = groups.instant
+            key, rate, instant = key[first], rate[first], instant[first]
+        if reduction is not None:
+            values = np.maximum(values - reduction.ravel()[key, None], 0.0)
         weights = np.zeros((len(free_gaps), len(rate)))
         weights[rate, np.arange(len(rate))] = self._weights[instant]
         return _Evaluated(weights @ values, gaps, pairs)

@@ -109,7 +109,7 @@ class RCAMO(Policy):
         self._patience = finite_number(patience, "RCAMO: patience", "m", above=0.0)
         self._arrival = finite_number(arrival, "RCAMO: arrival", "m", above=0.0)
         steps = whole_number(horizon, "RCAMO: horizon", at_least=1, at_most=200)
-        self._times = finite_number(interval, "RCAMO: interval", "s", above=0.0) * np.arange(1.0, steps + 1.0)
+        times = finite_number(interval, "RCAMO: interval", "s", above=0.0) * np.arange(1.0, steps + 1.0)
         limit = finite_number(max_acceleration, "RCAMO: max_acceleration", "m/s^2", above=0.0)
         spheres = np.zeros((1, 4)) if self.tool_spheres is None else self.tool_spheres
         self._spheres = spheres[:, :3]
@@ -117,12 +117,11 @@ class RCAMO(Policy):
         forbidden = finite_array(np.reshape(np.asarray(self.forbidden, dtype=float), (-1, 3)), (None, 3), "forbidden")
         self._axes, rest = allowed_axes(forbidden / np.linalg.norm(forbidden, axis=1, keepdims=True))
         self._one_sided = rest @ self._axes.T
-        response = Response.of(self.gains, self._tau, self._times)
         obstacle_cost: ObstacleCost = DistanceCost(self.clearance, spheres[:, 3])
         if cost == "gaussian":
             whole = LeastCost.deviation_weight * float(np.sum(LeastCost.discount ** np.arange(1.0, steps + 1.0)))
             obstacle_cost = GaussianCost(self.clearance, spheres[:, 3], stiffness=whole)
-        self.least_cost = LeastCost(response, obstacle_cost, limit, headings(self._axes))
+        self.least_cost = LeastCost(times, self.gains, self._tau, obstacle_cost, limit, headings(self._axes))
         self._dmp, self._precision = _primitive(skill, self.gains), learned_precision(skill)
         self._steps: dict[float, Response] = {}
         self._path: PrimitivePath | None = None
@@ -231,26 +230,28 @@ class RCAMO(Policy):
         if near is None:
             self._scaled = STAY.scaled
             return STAY
-        free = self.least_cost.response.free(self._deviation)
-        free = free + self.least_cost.response.A[:, None] * lag
+        least_cost, times = self.least_cost, self.least_cost.times
+        free = least_cost.response.free(self._deviation) + least_cost.response.A[:, None] * lag
+
+        goal = path.goal.position + self._offsets(path, path.nearest(np.ones((1, 1))))[0, 0]
 
         def predict(rates: Array) -> Prediction:
-            phases = self._phases(rates[:, None], self._times)
+            phases = self._phases(rates[:, None], times)
             samples = path.nearest(phases)
             centers = (path.positions_at(phases) + free)[:, :, None]
             if self._spheres.any():
                 centers = centers + self._offsets(path, samples)
-            return Prediction(centers, free, path.precision[samples])
+            return Prediction(centers, free, path.precision[samples], phases >= 1.0, goal)
 
         axes = frame(path.tangent(self._phase), self._axes)
-        chosen = self.least_cost.choose(axes, self._one_sided, self._scaled, predict, near.obstacles)
+        chosen = least_cost.choose(axes, self._one_sided, self._scaled, predict, near.obstacles)
         self._scaled = chosen.scaled
         return chosen
 
     def _offsets(self, path: PrimitivePath, samples: NDArray[np.intp]) -> Array:
         """Return the centres of the tool's spheres relative to its tip, shape (R, H, S, 3) [m]."""
         if path.rotations is None:
-            return self._spheres @ quaternion_to_matrix(self._hold).T
+            return (self._spheres @ quaternion_to_matrix(self._hold).T)[None, None]
         return np.matmul(path.rotations[samples], self._spheres.T).swapaxes(-1, -2)
 
     def _near(self, observation: Observation, path: PrimitivePath) -> _Near | None:
@@ -259,7 +260,7 @@ class RCAMO(Policy):
         packed = scene.packed
         if not len(packed):
             return None
-        elapsed, span = observation.time - scene.stamp, float(self._times[-1])
+        elapsed, span = observation.time - scene.stamp, float(self.least_cost.times[-1])
         x = observation.tool_to_base.position
         offset = packed.positions + elapsed * packed.velocities - x
         gap = np.sqrt(np.sum(offset * offset, axis=1)) - packed.radii
@@ -275,24 +276,24 @@ class RCAMO(Policy):
             return None
         if len(indices) < len(packed):
             packed, margin = packed.take(indices), margin[indices]
-        return _Near(PredictedObstacles(packed, elapsed + self._times, margin), indices)
+        return _Near(PredictedObstacles(packed, elapsed + self.least_cost.times, margin), indices)
 
     def _travel(self, path: PrimitivePath) -> float:
         """Return a bound of the tool's travel within the horizon [m]."""
         response, (e, v) = self.least_cost.response, self._deviation
         own = np.abs(response.A - 1.0).max() * np.sqrt(e.dot(e)) + np.abs(response.B).max() * np.sqrt(v.dot(v))
-        return float(own + self.least_cost.travel + path.speed * self._times[-1])
+        return float(own + self.least_cost.travel + path.speed * self.least_cost.times[-1])
 
     def _margins(self, covariances: Array, elapsed: float) -> Array:
         """Return the additional distance to each of n obstacles at each instant, shape (n, H) [m]."""
         n = len(covariances)
         if self._margin is not None:
-            grown = self._margin.at(elapsed + self._times)
-            return np.broadcast_to(grown, (n, len(self._times)))
+            grown = self._margin.at(elapsed + self.least_cost.times)
+            return np.broadcast_to(grown, (n, len(self.least_cost.times)))
         if not covariances.any():
-            return np.zeros((n, len(self._times)))
+            return np.zeros((n, len(self.least_cost.times)))
         sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[:, -1], 0.0))
-        return np.broadcast_to(np.minimum(self._beta * sigma, self._cap)[:, None], (n, len(self._times)))
+        return np.broadcast_to(np.minimum(self._beta * sigma, self._cap)[:, None], (n, len(self.least_cost.times)))
 
     def _rotation(self, path: PrimitivePath, tool: Pose, phase: float, dt: float) -> Array:
         """Return the angular velocity that follows the learned rotation, shape (3,) [rad/s]."""
