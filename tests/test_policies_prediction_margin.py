@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import mujoco
@@ -16,6 +16,7 @@ from imitarm.benchmark.avoidance import learn
 from imitarm.benchmark.families import random_obstacle
 from imitarm.kinematics.arm import ArmState
 from imitarm.kinematics.arm_path import ArmPath
+from imitarm.perception import CoverageMargin
 from imitarm.policies import HORIZONTAL_ONLY
 from imitarm.policies.arm_certificate import ArmAmongObstacles
 from imitarm.policies.prediction_margin import PredictionMargin, margins_in
@@ -24,15 +25,6 @@ from imitarm.trajectory import Demonstration, Trajectory
 from scene_shapes import coal_distances
 
 RADIUS, CLEARANCE = 0.02, 0.02
-
-
-@dataclass(frozen=True)
-class Margin:
-    offset: float
-    growth: float
-
-    def at(self, tau):
-        return self.offset + self.growth * tau
 
 
 @lru_cache
@@ -69,7 +61,7 @@ def test_the_tool_keeps_clearance_and_margin_at_all_times(seed, planar, offset, 
     skill, path = learned(planar)
     rng = np.random.default_rng(seed)
     scene = Scene(None, [crossing(rng, path, skill.duration_, planar) for _ in range(1 + seed % 3)])
-    margin = Margin(offset, growth)
+    margin = CoverageMargin(offset, growth)
     forbidden = HORIZONTAL_ONLY if planar else ()
     options = {"tool_radius": RADIUS, "clearance": CLEARANCE, "forbidden": forbidden}
     plan = adapt(skill, scene, margin=margin, margin_horizon=horizon, **options)
@@ -84,7 +76,7 @@ def test_the_tool_keeps_clearance_and_margin_at_all_times(seed, planar, offset, 
 
 def test_most_scenes_have_a_path_and_it_is_clear_by_another_library_too():
     skill, path = learned(planar=False)
-    margin, accepted = Margin(0.005, 0.01), 0
+    margin, accepted = CoverageMargin(0.005, 0.01), 0
     for seed in range(12):
         rng = np.random.default_rng([7, seed])
         scene = Scene(None, [crossing(rng, path, skill.duration_, False)])
@@ -107,7 +99,7 @@ def test_a_tool_of_several_spheres_that_rotates_keeps_the_margin(spheres):
     middle, _ = nominal.at([0.5 * nominal.duration])
     velocity = np.array([0.2, 0.0, 0.1])
     ball = Sphere(middle[0] - 0.5 * nominal.duration * velocity, 0.04, velocity=velocity)
-    margin = Margin(0.004, 0.008)
+    margin = CoverageMargin(0.004, 0.008)
     plan = adapt(skill, Scene(None, [ball]), tool_spheres=spheres, margin=margin)
     assert plan.feasible and plan.moved.any()
     for time in np.linspace(0.0, plan.trajectory.duration, 700):
@@ -172,7 +164,7 @@ def simulator_distances(arm, scene, plan, n=150):
 @pytest.mark.parametrize("name", ARMS)
 def test_the_whole_arm_keeps_clearance_and_margin_by_the_simulators_geometry(name):
     skill, arm, start = carrying(name)
-    margin, accepted, moved = Margin(0.005, 0.01), 0, 0
+    margin, accepted, moved = CoverageMargin(0.005, 0.01), 0, 0
     for seed in range(10):
         rng = np.random.default_rng([3, seed])
         scene = Scene(None, [crossing_the_arm(arm, rng, skill.duration_) for _ in range(1 + seed % 2)])
@@ -190,7 +182,7 @@ def test_planning_again_keeps_the_margin_from_now_on():
     skill, arm, start = carrying("sawyer")
     rng = np.random.default_rng(1)
     scene = Scene(None, [crossing_the_arm(arm, rng, skill.duration_)])
-    margin = Margin(0.005, 0.01)
+    margin = CoverageMargin(0.005, 0.01)
     plan = adapt(skill, scene, arm=arm, state=at(arm, start), margin=margin, **OPTIONS)
     assert plan.feasible, plan.reason
     for share in (0.2, 0.5):
@@ -236,14 +228,14 @@ def test_without_a_margin_and_with_a_margin_of_zero_everything_is_the_same():
     rng = np.random.default_rng(2)
     scene = Scene(None, [crossing(rng, path, skill.duration_, False) for _ in range(2)])
     one = adapt(skill, scene, tool_radius=RADIUS)
-    two = adapt(skill, scene, tool_radius=RADIUS, margin=Margin(0.0, 0.0), margin_horizon=1.0)
+    two = adapt(skill, scene, tool_radius=RADIUS, margin=CoverageMargin(0.0, 0.0), margin_horizon=1.0)
     assert one.trajectory.positions.tobytes() == two.trajectory.positions.tobytes()
     assert one.certified_clearance == two.certified_clearance
     assert (one.validity, one.reason) == (two.validity, two.reason)
     carry, arm, start = carrying("panda")
     scene = Scene(None, [crossing_the_arm(arm, rng, carry.duration_)])
     one = adapt(carry, scene, arm=arm, state=at(arm, start), **OPTIONS)
-    two = adapt(carry, scene, arm=arm, state=at(arm, start), margin=Margin(0.0, 0.0), **OPTIONS)
+    two = adapt(carry, scene, arm=arm, state=at(arm, start), margin=CoverageMargin(0.0, 0.0), **OPTIONS)
     assert one.joints.tobytes() == two.joints.tobytes()
     assert one.trajectory.times.tobytes() == two.trajectory.times.tobytes()
 
@@ -260,7 +252,7 @@ def test_only_obstacles_that_are_estimated_have_a_margin():
         ],
         stamp=2.0,
     )
-    around = margins_in(scene, Margin(0.01, 0.1), None)
+    around = margins_in(scene, CoverageMargin(0.01, 0.1), None)
     assert around[0] is None
     assert all(margin == PredictionMargin(0.01, 0.1) for margin in around[1:])
     assert margins_in(scene, None, None) == (None,) * 4
@@ -269,12 +261,12 @@ def test_only_obstacles_that_are_estimated_have_a_margin():
 def test_the_margin_counts_from_when_the_obstacle_was_seen():
     ball = Sphere([0.5, 0.0, 0.0], 0.03, velocity=[0.1, 0.0, 0.0])
     later = Scene(None, [ball], stamp=1.0).at(1.25)
-    (margin,) = margins_in(later, Margin(0.01, 0.1), 0.5)
+    (margin,) = margins_in(later, CoverageMargin(0.01, 0.1), 0.5)
     assert margin is not None
     np.testing.assert_allclose(margin.at(np.array([0.0, 0.1, 0.25, 2.0])), [0.035, 0.045, 0.06, 0.06])
     np.testing.assert_array_equal(margin.slopes_after(np.array([0.1, 0.25])), [0.1, 0.0])
     np.testing.assert_array_equal(margin.slopes_before(np.array([0.1, 0.25, 0.3])), [0.1, 0.1, 0.0])
-    (long_ago,) = margins_in(later, Margin(0.01, 0.1), 0.2)
+    (long_ago,) = margins_in(later, CoverageMargin(0.01, 0.1), 0.2)
     assert long_ago is not None
     np.testing.assert_allclose(long_ago.at(np.array([0.0, 5.0])), [0.03, 0.03])
 
@@ -284,13 +276,15 @@ def test_a_refusal_says_that_the_margin_is_missing():
     goal = Sphere(path[-1] + [0.0, 0.0, 0.08], 0.03, track_id=1, name="cup")
     scene = Scene(None, [goal])
     assert adapt(skill, scene, tool_radius=RADIUS, clearance=0.01).feasible
-    plan = adapt(skill, scene, tool_radius=RADIUS, clearance=0.01, margin=Margin(0.01, 0.05))
+    plan = adapt(skill, scene, tool_radius=RADIUS, clearance=0.01, margin=CoverageMargin(0.01, 0.05))
     assert not plan.feasible
     assert "beyond the margin for its prediction" in plan.reason
 
 
-@pytest.mark.parametrize("wrong", [0.1, Margin(-1.0, 0.0), Margin(0.0, np.nan)])
-def test_a_margin_that_is_none_is_rejected(wrong):
+def test_a_margin_that_is_none_is_rejected():
     skill, _ = learned(planar=False)
+    far = Scene(None, [Sphere([9.0, 0.0, 0.0], 0.1, track_id=1)])
     with pytest.raises(InputError, match="margin"):
-        adapt(skill, Scene(None, [Sphere([9.0, 0.0, 0.0], 0.1, track_id=1)]), tool_radius=RADIUS, margin=wrong)
+        adapt(skill, far, tool_radius=RADIUS, margin=0.1)
+    with pytest.raises(InputError, match="margin_horizon"):
+        adapt(skill, far, tool_radius=RADIUS, margin=CoverageMargin(0.01), margin_horizon=-1.0)

@@ -6,14 +6,17 @@
 from imitarm.policies.acfra import ACFRA
 from imitarm.policies.adaptation import ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN, adapt
 from imitarm.policies.adapted_path import Adaptation
+from imitarm.policies.certified_replanning import CertifiedRCAMO
 from imitarm.policies.least_detour import PathAdapter
 from imitarm.policies.obstacle_cost import DistanceCost, GaussianCost, ObstacleCost
 from imitarm.policies.path_policy import PathPlan, PathPolicy
+from imitarm.policies.plan_in_execution import PlanInExecution
 from imitarm.policies.policy import Observation, Policy
 from imitarm.policies.primitive_path import PrimitivePath
 from imitarm.policies.rcamo import RCAMO
 from imitarm.policies.replanning import replan
 from imitarm.policies.stages import Stage, StagedPolicy
+from imitarm.policies.stopping import Stop, certified_stop
 from imitarm.registry import Registry
 
 POLICIES: Registry[type[Policy]] = Registry(
@@ -22,6 +25,7 @@ POLICIES: Registry[type[Policy]] = Registry(
     {
         "acfra": "imitarm.policies.acfra:ACFRA",
         "rcamo": "imitarm.policies.rcamo:RCAMO",
+        "rcamo-certified": "imitarm.policies.certified_replanning:CertifiedRCAMO",
         "apf": "imitarm.policies.baselines.apf:APF",
         "dmp-steering": "imitarm.policies.baselines.dmp_steering:DMPSteering",
         "dmp-potential": "imitarm.policies.baselines.dmp_potential:DMPPotential",
@@ -48,6 +52,7 @@ __all__ = [
     "POLICIES",
     "RCAMO",
     "Adaptation",
+    "CertifiedRCAMO",
     "DistanceCost",
     "GaussianCost",
     "Observation",
@@ -55,10 +60,13 @@ __all__ = [
     "PathAdapter",
     "PathPlan",
     "PathPolicy",
+    "PlanInExecution",
     "Policy",
     "PrimitivePath",
     "Stage",
     "StagedPolicy",
+    "Stop",
     "adapt",
+    "certified_stop",
     "replan",
 ]

@@ -38,6 +38,7 @@ Index = NDArray[np.intp]
 _STRIDE = 4  # the rounds look at every fourth sample, the last ones at all
 _ROUNDS = 24
 _FINAL_ROUNDS = 10  # with all samples
+_QUICK_ROUNDS = 8, 4  # of both, when the time is limited
 _PATIENCE, _LESS_PATIENCE = 7, 3  # rounds without progress, then this attempt is given up: usually, and far from clear
 _FAR = 0.02  # [m] an attempt that lacks more is far from clear
 _PROGRESS, _NEARLY = 1e-3, 0.2  # progress that counts: of the smallest distance [m], or as a fraction of what it lacks
@@ -110,6 +111,7 @@ class ArmPlanner:
         tilts: possible rotations of the tool away from the learned rotation; at the goal, ``max_tilt`` limits them too.
         begun: whether the motion has begun, so that the self-motion must not change the velocity at the start.
         spare: clearance that is planned for in addition, if possible, but not required [m].
+        quick: whether to give up after fewer rounds.
 
     Attributes:
         coarse: indices of the few samples that are planned first, before all samples, shape (k,).
@@ -130,6 +132,7 @@ class ArmPlanner:
         free_start: bool = False,
         begun: bool = False,
         spare: float = 0.0,
+        quick: bool = False,
     ) -> None:
         self.around, self.arm, self.components, self.free_start, self.begun = (
             around,
@@ -140,6 +143,7 @@ class ArmPlanner:
         )
         self.quaternions, self.max_tilt, self.allowed = quaternions, max_tilt, allowed
         self.spare, self.times = spare, components.nominal.times
+        self._rounds = _QUICK_ROUNDS if quick else (_ROUNDS, _FINAL_ROUNDS)
         self.clock = self.times
         n = len(self.times)
         self.coarse = np.unique(np.append(np.arange(0, n, _STRIDE), n - 1))
@@ -176,7 +180,7 @@ class ArmPlanner:
         state = self._closed(joints, displacement, tilt, self.coarse)
         if state is None:
             return None
-        best = self._improved(state, displacement, tilt, self.coarse, _ROUNDS)
+        best = self._improved(state, displacement, tilt, self.coarse, self._rounds[0])
         if best.clearance.room < 0.0:
             return best
         samples = np.arange(len(self.times))
@@ -184,7 +188,7 @@ class ArmPlanner:
         state = self._closed(spline(self.times), best.displacement, best.tilt, samples)
         if state is None:
             return best
-        return self._improved(state, best.displacement, best.tilt, samples, _FINAL_ROUNDS)
+        return self._improved(state, best.displacement, best.tilt, samples, self._rounds[1])
 
     def _closed(self, joints: Array, displacement: Array, tilt: Array, samples: Index) -> ArmPath | None:
         """Return the joint path that moves the tool exactly to its poses; None when a pose is out of reach."""

@@ -18,29 +18,16 @@ path, as :math:`d_i` is. The certificates therefore hold for :math:`d_i - m_i` w
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.errors import InputError
+from imitarm.perception.margins import CoverageMargin
 from imitarm.scene.obstacle import Obstacle
 from imitarm.scene.scene import Scene
-from imitarm.validation import finite_number
+from imitarm.validation import finite_number, instance
 
 Array = NDArray[np.float64]
-
-
-class Margin(Protocol):
-    """What a plan needs of a :class:`~imitarm.perception.CoverageMargin`: ``offset`` [m] and ``growth`` [m/s]."""
-
-    @property
-    def offset(self) -> float:
-        """Bound of the error when the obstacle is seen [m]."""
-
-    @property
-    def growth(self) -> float:
-        """Growth of the bound with time [m/s]."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +57,9 @@ class PredictionMargin:
         return np.where(times <= self.until, self.growth, 0.0)
 
 
-def margins_in(scene: Scene, margin: Margin | None, horizon: float | None) -> tuple[PredictionMargin | None, ...]:
+def margins_in(
+    scene: Scene, margin: CoverageMargin | None, margin_horizon: float | None
+) -> tuple[PredictionMargin | None, ...]:
     """Return the margin of each obstacle of a scene; None for an obstacle whose place is known.
 
     A margin applies to an obstacle that a tracker estimates (with a ``track_id`` or a ``covariance``), and to one that
@@ -79,21 +68,16 @@ def margins_in(scene: Scene, margin: Margin | None, horizon: float | None) -> tu
     Args:
         scene: obstacles at the time at which a plan begins. ``scene.packed.stamps`` says when each was seen.
         margin: bound of the error of predictions; None: predictions are exact.
-        horizon: time since an obstacle was seen after which the margin does not grow [s]; None: it always grows.
+        margin_horizon: time since an obstacle was seen after which the margin does not grow [s]; None: it always grows.
 
     Raises:
         InputError: when an argument is not valid.
     """
     if margin is None:
         return (None,) * len(scene.packed)
-    try:
-        offset, growth = margin.offset, margin.growth
-    except AttributeError as error:
-        raise InputError(f"margin must be a CoverageMargin (with offset and growth) or None, got {margin!r}") from error
-    offset = finite_number(offset, "margin: offset", "m", at_least=0.0)
-    growth = finite_number(growth, "margin: growth", "m/s", at_least=0.0)
-    until = np.inf if horizon is None else finite_number(horizon, "margin_horizon", "s", at_least=0.0)
-    if offset == 0.0 and growth == 0.0:
+    offset, growth = instance(margin, CoverageMargin, "margin").offset, margin.growth
+    until = np.inf if margin_horizon is None else finite_number(margin_horizon, "margin_horizon", "s", at_least=0.0)
+    if margin.is_zero:
         return (None,) * len(scene.packed)
     ages = np.maximum(scene.stamp - scene.packed.stamps, 0.0).tolist()
     return tuple(

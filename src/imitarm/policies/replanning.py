@@ -10,12 +10,15 @@ from numpy.typing import ArrayLike
 
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel, ArmState
-from imitarm.policies.adaptation import allowed_directions, depends_on_time, of_whole_arm, tilt_limits
+from imitarm.perception.margins import CoverageMargin
+from imitarm.policies.adaptation import allowed_directions, of_whole_arm, tilt_limits
 from imitarm.policies.adapted_path import Adaptation
+from imitarm.policies.arm_task import ArmTask
 from imitarm.policies.component_path import STILL
-from imitarm.policies.prediction_margin import Margin, margins_in
+from imitarm.policies.explanations import depends_on_time
+from imitarm.policies.prediction_margin import margins_in
 from imitarm.policies.remainder import Remainder
-from imitarm.policies.whole_arm import ArmTask, solve
+from imitarm.policies.whole_arm import solve
 from imitarm.scene.scene import Scene
 from imitarm.trajectory import Trajectory
 from imitarm.validation import finite_number, instance
@@ -35,8 +38,10 @@ def replan(
     max_tilt: float | None = None,
     goal_tilt: float = 0.0,
     allowance: float = 0.0,
-    margin: Margin | None = None,
+    margin: CoverageMargin | None = None,
     margin_horizon: float | None = None,
+    hold: float = 0.0,
+    max_attempts: int | None = None,
 ) -> Adaptation:
     """Plan the rest of a motion again, for example because an obstacle is not where it was.
 
@@ -62,6 +67,9 @@ def replan(
             path with this larger clearance is found [m].
         margin: bound of the error with which obstacles are predicted; see :func:`adapt`.
         margin_horizon: time since an obstacle was seen after which its margin does not grow [s]; see :func:`adapt`.
+        hold: time after the arrival for which the whole arm must keep its clearances at the goal too [s].
+        max_attempts: largest number of attempts of the search for a joint path, to limit the computing time; None: no
+            limit. Attempts to execute the path later, so that obstacles pass first, are not counted.
 
     Returns:
         The adaptation of the rest of the motion; check ``feasible`` before executing it. If it is not feasible, the arm
@@ -84,6 +92,7 @@ def replan(
     clearance = finite_number(clearance, "clearance", "m", at_least=0.0)
     extra = finite_number(allowance, "allowance", "m", at_least=0.0)
     at_goal = finite_number(goal_tilt, "goal_tilt", "rad", at_least=0.0)
+    rest_at_goal = finite_number(hold, "hold", "s", at_least=0.0)
     allowed = allowed_directions(forbidden)
     done, times = previous.trajectory.times, plan.components.nominal.times
     now = finite_number(phase, "phase", "s", at_least=0.0)
@@ -108,6 +117,7 @@ def replan(
     extras = (extra, 0.0) if previous.certified_clearance >= clearance + extra else (0.0,)
     for more in dict.fromkeys(extras):
         task = ArmTask(arm, q, scene, clearance + more, allowed, limit, at_goal, more, rest, around)
+        task = replace(task, hold=rest_at_goal, max_attempts=max_attempts)
         solution = solve(task, rest.components, rest.displacement)
         found = of_whole_arm(unplanned, solution, scene, clearance + more, began, around)
         if found.feasible:

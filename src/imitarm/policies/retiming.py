@@ -10,10 +10,15 @@ A first pass, from the end to the start, finds for each sample the largest :math
 still be executed. A second pass, from the start to the end, takes the largest possible :math:`a` at each sample. The
 method is that of Pham and Pham, "A new approach to time-optimal path parameterization based on reachability analysis",
 IEEE T-RO 34(3), 2018.
+
+A *schedule* executes a path later or more slowly, so that a moving obstacle can pass first. It is an upper limit of the
+rate ds/dt at each sample. A *wait* at a sample is a very slow motion from this sample to the next one. The method above
+then brakes the arm before this place and accelerates it afterwards, within all limits.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +46,9 @@ _SELF_RATE = 5.0  # [1/s] that rate between links
 _DELAY = 0.02  # [s] of the commands: twice the usual control period
 _REACH = 0.15  # [m] pairs farther apart than the clearance and this do not slow the motion among resting obstacles
 _CREEP = 1e-3  # [m/s] closing speed that is always allowed, so that the motion goes on
+_WAITS = (0.4, 0.8, 1.4, 2.2, 3.2)  # [s] of a wait
+_WAIT_AFTER = (0.0, 0.15, 0.3, 0.5, 0.8, 1.2, 1.8)  # [s] in the learned motion, before a wait
+_SLOWER = (0.75, 0.5, 0.35)  # rates of the whole motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +59,13 @@ class Timing:
         times: time of each sample, from 0, shape (n,) [s].
         blocked: index of the first sample at which a limit does not allow any motion; -1 if there is no such sample.
         joint: index of the joint whose torque limit does not allow any motion; -1 if there is no such joint.
+        rate: the rate ds/dt at the first sample.
     """
 
     times: Array
     blocked: int = -1
     joint: int = -1
+    rate: float = 0.0
 
 
 def retimed(
@@ -95,7 +105,7 @@ def retimed(
     slow = np.flatnonzero(means <= _SLOWEST)
     if len(slow):
         return Timing(np.array(parameters - parameters[0]), int(slow[0]), -1)
-    return Timing(np.concatenate([[0.0], np.cumsum(np.diff(parameters) / means)]))
+    return Timing(np.concatenate([[0.0], np.cumsum(np.diff(parameters) / means)]), rate=float(speeds[0]))
 
 
 def safe_rates(
@@ -104,10 +114,9 @@ def safe_rates(
     """Return the largest rate ds/dt at each sample at which no distance shrinks faster than the safety filter allows.
 
     The distances may shrink at nine tenths of the rates of the filter's own rows
-    (:func:`~imitarm.scene.braking.shrink_rates`).
-    The safety filter measures distances to where the obstacles are predicted, so margins are left out. An obstacle that
-    approaches by itself does not slow the motion down: the arm would still be in its way. The path and its times must
-    keep the clearance in that case.
+    (:func:`~imitarm.scene.braking.shrink_rates`). The safety filter measures distances to where the obstacles are
+    predicted, so margins are left out. An obstacle that approaches by itself does not slow the motion down: the arm
+    would still be in its way. The path and its times must keep the clearance in that case.
 
     Args:
         around: the arm, its obstacles and the required clearances.
@@ -140,6 +149,46 @@ def safe_rates(
     counts = ~own & (path.arm.cover.links[gaps.sphere] == path.arm.n_joints) if tool_only else slice(None)
     np.minimum.at(fastest, gaps.sample[counts], (allowed / approach)[counts])
     return fastest
+
+
+@dataclass(frozen=True, eq=False)
+class Schedule:
+    """One schedule.
+
+    Attributes:
+        fastest: largest rate ds/dt at each sample, shape (n,).
+        clock: time of each sample, roughly, without limits of acceleration, shape (n,) [s].
+        delay: by how much the motion arrives later [s].
+    """
+
+    fastest: Array
+    clock: Array
+    delay: float
+
+
+def schedules(times: Array, clock: Array, *, at_rest: bool) -> list[Schedule]:
+    """Return schedules for a path, the smallest delay first.
+
+    Args:
+        times: times of the samples in the learned motion, from 0, shape (n,) [s].
+        clock: times at which the samples are reached without a delay, shape (n,) [s].
+        at_rest: whether the motion begins at rest, so that the arm can wait where it is.
+    """
+    return sorted(_schedules(times, clock, at_rest), key=lambda one: one.delay)
+
+
+def _schedules(times: Array, clock: Array, at_rest: bool) -> Iterator[Schedule]:
+    n = len(times)
+    for ahead in _WAIT_AFTER if at_rest else _WAIT_AFTER[1:]:
+        i = int(np.searchsorted(times, ahead))
+        if i > n - 3:
+            break
+        for delay in _WAITS:
+            fastest = np.ones(n)
+            fastest[i : i + 2] = (times[i + 1] - times[i]) / delay
+            yield Schedule(fastest, clock + delay * (np.arange(n) > i), delay)
+    for rate in _SLOWER:
+        yield Schedule(np.full(n, rate), clock / rate, float(clock[-1]) * (1.0 / rate - 1.0))
 
 
 def _squared_speeds(of_a: Array, of_b: Array, bound: Array, most: Array, first: float) -> Array:

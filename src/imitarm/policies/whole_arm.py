@@ -17,8 +17,9 @@ If no attempt succeeds, the reason states which link and obstacle come too close
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -31,15 +32,13 @@ from imitarm.policies.approach import Approach, find_approach
 from imitarm.policies.arm_certificate import ArmAmongObstacles, ArmClearance
 from imitarm.policies.arm_pairs import SELF
 from imitarm.policies.arm_planner import JOINT_LIMIT, TILT_LEVER, TILT_LIMIT, ArmPlan, ArmPlanner
+from imitarm.policies.arm_task import ArmSolution, ArmTask
 from imitarm.policies.component_path import ComponentPath
 from imitarm.policies.goal_postures import GoalPosture, GoalSearch, clear_postures
-from imitarm.policies.least_detour import SMOOTHNESS, AllowedDirections
-from imitarm.policies.prediction_margin import PredictionMargin
-from imitarm.policies.remainder import Remainder
-from imitarm.policies.retiming import SELF_CLEARANCE, Timing, retimed, safe_rates
+from imitarm.policies.least_detour import SMOOTHNESS
+from imitarm.policies.retiming import SELF_CLEARANCE, Schedule, Timing, retimed, safe_rates, schedules
 from imitarm.policies.tilts import Tilts
 from imitarm.scene.clearance import SelfClearance
-from imitarm.scene.scene import Scene
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -48,6 +47,9 @@ _REACH = 0.15  # [m] largest clearance that is reported
 _RETIMINGS = 6  # among moving obstacles
 _SPARE = 2e-3  # [m] of clearance that is planned for, because new execution times change the distances
 _AHEAD = 0.05  # of the duration: a place this close to the goal is the goal
+_MOST_SCHEDULES, _FEW_SCHEDULES = 4, 2  # for which a plan is made: usually, when the time is limited
+_DELAY_FOR_ROOM = 40.0  # [s/m] a schedule that lacks a centimetre is as good as one that takes 0.4 s longer
+_SLOW, _KEPT_RATE = 0.02, 0.9  # rate of an arm that rests; fraction of the present rate with which a plan must begin
 _SIDES = 8  # directions tried across the path
 _AWAY = (0.1, 0.2)  # [m] by which the path is moved to another side
 _MOST_SIDES = 5  # that are followed up
@@ -55,57 +57,6 @@ _GOALS = 3  # postures at the goal that are tried first
 _LATE, _MORE = 1.45, 6  # times the learned duration: a plan that takes longer is kept, and so many more are tried
 _NEARLY, _MOST_NEARLY = 0.02, 3  # [m] a failed attempt that lacks less is tried again; number of such attempts
 _LEVER = 0.05  # squared influence of the components; a place with less is not moved
-
-
-@dataclass(frozen=True, eq=False)
-class ArmSolution:
-    """The result of the search for a joint path.
-
-    Attributes:
-        plan: the plan, or the best attempt; None when the arm can't follow the path at all.
-        timing: execution times of the plan; None if no plan is feasible.
-        reason: why there is no plan; empty if there is one.
-        approach: motion from the task's start posture to the plan's first posture; None if the two are the same.
-    """
-
-    plan: ArmPlan | None
-    timing: Timing | None
-    reason: str
-    approach: Approach | None = None
-
-    @property
-    def duration(self) -> float:
-        """Duration of the approach and of the plan [s]; inf without a timing."""
-        own = np.inf if self.timing is None else float(self.timing.times[-1])
-        return own if self.approach is None else own + float(self.approach.times[-1])
-
-
-@dataclass(frozen=True, eq=False)
-class ArmTask:
-    """The input of the search: the arm, its surroundings, and the limits that the plan must keep.
-
-    Attributes:
-        arm: the arm with its tool.
-        start: posture at the start, shape (n_joints,) [rad].
-        scene: obstacles at time 0, and fixtures.
-        clearance: required distance from every moving part of the arm to every obstacle [m].
-        allowed: directions in which the components of the path may be displaced.
-        max_tilt: largest rotation of the tool away from the learned rotation at each sample, shape (n,) [rad].
-        allowance: ``clearance`` minus the clearance that the safety filter keeps [m].
-        rest: the rest of a motion that has begun; None: the motion begins at rest.
-        margins: the margin of each obstacle, or None for an obstacle without a margin; None: there are no margins.
-    """
-
-    arm: ArmModel
-    start: Array
-    scene: Scene
-    clearance: float
-    allowed: AllowedDirections
-    max_tilt: Array
-    goal_tilt: float
-    allowance: float
-    rest: Remainder | None = None
-    margins: Sequence[PredictionMargin | None] | None = None
 
 
 def solve(task: ArmTask, path: ComponentPath, displacement: Array) -> ArmSolution:
@@ -123,21 +74,21 @@ def solve(task: ArmTask, path: ComponentPath, displacement: Array) -> ArmSolutio
     best: ArmPlan | None = None
     late: ArmSolution | None = None
     more = _MORE
-    for planner, moved, joints, tilt in search.attempts():
+    for tried, attempt in enumerate(islice(search.attempts(), task.max_attempts)):
         if late is not None:
             more -= 1
             if more < 0:
                 break
+        planner, moved, joints, tilt = attempt
         plan = planner.plan(moved, joints, tilt)
-        if plan is None:
-            continue
-        if not plan.feasible:
+        if plan is not None and not plan.feasible:
             best = plan if best is None or _rank(plan) > _rank(best) else best
             search.failed(planner, plan)
-            continue
-        found = search.solution(planner, plan)
+        found = search.solution(planner, plan) if plan is not None and plan.feasible else None
+        if found is None and tried == 0:
+            found = search.later(attempt)
         if found is None:
-            search.mistimed = True
+            search.mistimed |= plan is not None and plan.feasible
             continue
         late = found if late is None or found.duration < late.duration else late
         if task.rest is not None or found.reason or late.duration <= _LATE * path.nominal.duration:
@@ -322,6 +273,7 @@ class _Search:
             free_start=free_start,
             begun=rest is not None,
             spare=_SPARE if self._moving else 0.0,
+            quick=self.task.max_attempts == 1,
         )
 
     def _followed(self, planner: ArmPlanner, displacement: Array, goal: GoalPosture | None = None) -> _Attempt:
@@ -359,18 +311,66 @@ class _Search:
                 found.append((float(-gaps.room.sum()), len(found), attempt))
         return [attempt for _, _, attempt in sorted(found, key=lambda one: one[:2])[:_MOST_SIDES]]
 
-    def timed(self, planner: ArmPlanner, plan: ArmPlan) -> tuple[ArmPlan, Timing] | None:
+    def later(self, attempt: _Attempt) -> ArmSolution | None:
+        """Return a plan that is executed later or more slowly, so that moving obstacles pass first; None without one.
+
+        The first guess of the attempt is compared with all schedules, at a few samples. A plan is then made for the
+        best schedules.
+        """
+        if not self._moving:
+            return None
+        planner, displacement, joints, tilt = attempt
+        path = ArmPath.of(self.task.arm, joints)
+        clock = self._timing(path, self._times[planner.coarse], self._times[planner.coarse], None).times
+        clock = np.interp(self._times, self._times[planner.coarse], clock)
+        rated: list[tuple[float, float, Schedule]] = []
+        for schedule in schedules(self._times, clock, at_rest=self.task.rest is None or self.task.rest.rate < _SLOW):
+            room = self._around.clearance_at(path, schedule.clock[planner.coarse], 0.0).room
+            room = min(room, self._held(joints[-1], float(schedule.clock[-1])))
+            rated.append((schedule.delay + _DELAY_FOR_ROOM * max(-room, 0.0), room, schedule))
+        most = _MOST_SCHEDULES if self.task.max_attempts is None else _FEW_SCHEDULES
+        rated.sort(key=lambda one: one[0])
+        chosen = [schedule for _, _, schedule in rated[:most]]
+        clear = [schedule for _, room, schedule in rated if room >= 0.0]
+        if clear and clear[0] not in chosen:
+            chosen[-1] = clear[0]
+        for schedule in chosen:
+            planner.clock = schedule.clock
+            plan = planner.plan(displacement, joints, tilt)
+            timed = None if plan is None or not plan.feasible else self.timed(planner, plan, schedule.fastest)
+            if timed is not None and timed[1].blocked < 0:
+                return ArmSolution(*timed, "")
+        planner.clock = self._times
+        return None
+
+    def _held(self, joints: Array, time: float) -> float:
+        """Return the clearance of a posture that is held from a time on, at most 0 [m]."""
+        if self.task.hold == 0.0:
+            return 0.0
+        path = ArmPath.of(self.task.arm, np.stack([joints, joints]))
+        return min(self._around.clearance_of(path, np.array([time, time + self.task.hold])).room, 0.0)
+
+    def timed(self, planner: ArmPlanner, plan: ArmPlan, fastest: Array | None = None) -> tuple[ArmPlan, Timing] | None:
         """Return a plan with execution times within the limits of the arm and of the safety filter.
 
         New execution times change the distances to moving obstacles. A new plan is then made for the new times, and it
         gets execution times of its own. This is repeated until a plan keeps its clearance at its own execution times.
         If this does not succeed, the result is None.
+
+        Args:
+            planner: the planner of the plan.
+            plan: the plan.
+            fastest: largest rate ds/dt at each sample, shape (n,); None: 1.
         """
         for _ in range(_RETIMINGS):
-            timing = self._timing(plan.path, self._times, planner.clock)
+            timing = self._timing(plan.path, self._times, planner.clock, fastest)
             if timing.blocked >= 0 or not self._moving:
                 return plan, timing
+            if fastest is not None and self.task.rest is not None and timing.rate < _KEPT_RATE * self.task.rest.rate:
+                return None  # the arm is too fast to brake in time
             planner.clock = timing.times
+            if self._held(plan.path.joints[-1], float(timing.times[-1])) < 0.0:
+                return None
             clearance = self._around.clearance_of(plan.path, timing.times)
             if clearance.room >= 0.0:
                 return replace(plan, clearance=clearance), timing
@@ -380,12 +380,14 @@ class _Search:
             plan = again
         return None
 
-    def _timing(self, path: ArmPath, times: Array, clock: Array) -> Timing:
+    def _timing(self, path: ArmPath, times: Array, clock: Array, limit: Array | None) -> Timing:
         """Return execution times for a path whose samples have the parameters ``times``.
 
-        Each sample is compared with the places of the obstacles at its time in ``clock``.
+        Each sample is compared with the places of the obstacles at its time in ``clock``. The rates are at most
+        ``limit``, if it is given.
         """
         fastest = safe_rates(self._around, path, times, clock, self.task.allowance)
+        fastest = fastest if limit is None else np.minimum(fastest, limit)
         rate = 0.0 if self.task.rest is None else self.task.rest.rate
         return retimed(self.task.arm, path.joints, times, fastest, path=path, rate=rate)
 

@@ -1,0 +1,75 @@
+"""ArmTask and ArmSolution: the input and the result of the search for a joint path."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.kinematics.arm import ArmModel
+from imitarm.policies.approach import Approach
+from imitarm.policies.arm_planner import ArmPlan
+from imitarm.policies.least_detour import AllowedDirections
+from imitarm.policies.prediction_margin import PredictionMargin
+from imitarm.policies.remainder import Remainder
+from imitarm.policies.retiming import Timing
+from imitarm.scene.scene import Scene
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ArmSolution:
+    """The result of the search for a joint path.
+
+    Attributes:
+        plan: the plan, or the best attempt; None when the arm can't follow the path at all.
+        timing: execution times of the plan; None if no plan is feasible.
+        reason: why there is no plan; empty if there is one.
+        approach: motion from the task's start posture to the plan's first posture; None if the two are the same.
+    """
+
+    plan: ArmPlan | None
+    timing: Timing | None
+    reason: str
+    approach: Approach | None = None
+
+    @property
+    def duration(self) -> float:
+        """Duration of the approach and of the plan [s]; inf without a timing."""
+        own = np.inf if self.timing is None else float(self.timing.times[-1])
+        return own if self.approach is None else own + float(self.approach.times[-1])
+
+
+@dataclass(frozen=True, eq=False)
+class ArmTask:
+    """The input of the search: the arm, its surroundings, and the limits that the plan must keep.
+
+    Attributes:
+        arm: the arm with its tool.
+        start: posture at the start, shape (n_joints,) [rad].
+        scene: obstacles at time 0, and fixtures.
+        clearance: required distance from every moving part of the arm to every obstacle [m].
+        allowed: directions in which the components of the path may be displaced.
+        max_tilt: largest rotation of the tool away from the learned rotation at each sample, shape (n,) [rad].
+        allowance: ``clearance`` minus the clearance that the safety filter keeps [m].
+        rest: the rest of a motion that has begun; None: the motion begins at rest.
+        margins: the margin of each obstacle, or None for an obstacle without a margin; None: there are no margins.
+        hold: time after the arrival for which the arm must keep its clearances at the goal [s].
+        max_attempts: largest number of attempts, apart from those that execute the path later; None: no limit.
+    """
+
+    arm: ArmModel
+    start: Array
+    scene: Scene
+    clearance: float
+    allowed: AllowedDirections
+    max_tilt: Array
+    goal_tilt: float
+    allowance: float
+    rest: Remainder | None = None
+    margins: Sequence[PredictionMargin | None] | None = None
+    hold: float = 0.0
+    max_attempts: int | None = None

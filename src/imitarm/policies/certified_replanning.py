@@ -1,0 +1,388 @@
+"""CertifiedRCAMO: among moving obstacles, plan the rest of the motion again and again, with a certificate each time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.command import Command, Status
+from imitarm.errors import InfeasibleError, InputError
+from imitarm.kinematics.arm import ArmState
+from imitarm.perception.margins import CoverageMargin
+from imitarm.policies.adaptation import adapt
+from imitarm.policies.adapted_path import Adaptation
+from imitarm.policies.component_path import STILL, ComponentPath
+from imitarm.policies.plan_in_execution import PlanInExecution
+from imitarm.policies.policy import Observation, Policy
+from imitarm.policies.prediction_margin import margins_in
+from imitarm.policies.rcamo import RCAMO
+from imitarm.policies.replanning import replan
+from imitarm.policies.stopping import Stop, certified_stop
+from imitarm.scene.scene import Scene
+from imitarm.skills.skill import Skill
+from imitarm.validation import finite_number
+
+Array = NDArray[np.float64]
+
+_STANDS = 0.01  # [rad/s] an arm whose joints are all slower than this is at rest
+_STANDING = 0.02  # [m/s] an obstacle slower than this can't be waited for
+_LAST = 0.1  # [s] before the goal, no further plan is made
+_BACK = 4  # every so many plans, the learned path is tried instead of the last plan
+_SOME, _MOST = 2, 12  # attempts of a plan from rest, first and later; one if the arm moves
+_SAME_START = 1e-4  # [m, rad] a start nearer than this to the learned one is the learned one
+
+
+@dataclass(frozen=True, eq=False)
+class _Stopping:
+    """A certified stop that the arm executes."""
+
+    stop: Stop
+    began: float
+
+    def joints_at(self, time: float) -> Array:
+        times = self.stop.times
+        return np.array([np.interp(time - self.began, times, column) for column in self.stop.joints.T])
+
+
+class CertifiedRCAMO(Policy):
+    r"""Re-plan the rest of the motion many times a second; follow only plans that are certified for the whole arm.
+
+    Each plan begins at the measured state of the arm, with the obstacles as seen now and their velocities. The whole
+    arm keeps, at each time t of the plan,
+
+    .. math:: d_i(t) \ge c + m_i(t)
+
+    to each predicted obstacle i (:mod:`~imitarm.policies.prediction_margin`). If the path can't pass an obstacle in
+    time, a plan may wait until the obstacle has passed (:mod:`~imitarm.policies.retiming`). A plan is void as soon as
+    one of its assumptions fails (:mod:`~imitarm.policies.plan_in_execution`): the arm is off schedule, a new obstacle
+    has appeared, or an obstacle has left its margin. Another plan is then made at once. The policy acts as follows:
+
+    1. A certified plan exists: the arm follows it.
+    2. No plan is certified, but the arm can brake to rest and stay there for a while, which is certified
+       (:func:`~imitarm.policies.stopping.certified_stop`): the arm brakes and waits.
+    3. Neither is certified, for example because an obstacle comes towards the arm:
+       :class:`~imitarm.policies.rcamo.RCAMO` commands the arm, which evades without a certificate.
+
+    In all cases the status and its reason name the obstacle, and the arm resumes as soon as a plan is certified. The
+    :class:`~imitarm.safety.SafetyFilter` should check every command, as for all policies. If only standing obstacles
+    make the motion impossible, ``reset`` refuses to start; if a moving obstacle does, the arm waits.
+
+    In a simulation, the plan is made within ``step``, and simulated time stands still meanwhile. A real system plans in
+    another process and takes up the plan when it is ready. Set ``planning_time`` to the duration that planning takes
+    there. A plan is then made for the state predicted at that later time, and used from then on.
+
+    Args:
+        skill: skill to reproduce.
+        rate: number of plans per second [Hz].
+        margin: bound of the error with which obstacles are predicted, a ``CoverageMargin``; None: predictions are
+            exact.
+        margin_horizon: time since an obstacle was seen after which its margin does not grow [s]; None: it always grows.
+            It should cover the time until the next plans and the time for braking.
+        planning_time: time from an observation until the plan made from it takes effect [s].
+        max_tilt: see :func:`~imitarm.policies.adapt`.
+        goal_tilt: see :func:`~imitarm.policies.adapt`.
+        pinned: see :func:`~imitarm.policies.adapt`.
+        allowance: additional clearance for tracking errors, used if a plan with it is found [m].
+        hold: time after the arrival for which a plan must be clear at the goal [s]; also the time for which a stop must
+            be clear.
+        gain: feedback of the joint positions [1/s].
+        arrival: the motion has arrived when the tool is nearer than this to the goal [m].
+        options: arguments of :class:`~imitarm.policies.Policy`; ``arm`` is required.
+
+    Attributes:
+        plans: number of plans that were tried since ``reset``.
+        certified: number of those that were certified.
+    """
+
+    def __init__(
+        self,
+        skill: Skill,
+        *,
+        rate: float = 15.0,
+        margin: CoverageMargin | None = None,
+        margin_horizon: float | None = 1.0,
+        planning_time: float = 0.0,
+        max_tilt: float | None = None,
+        goal_tilt: float = 0.0,
+        pinned: Any = (),
+        allowance: float = 0.005,
+        hold: float = 0.5,
+        gain: float = 8.0,
+        arrival: float = 0.003,
+        **options: Any,
+    ) -> None:
+        super().__init__(skill, **options)
+        name = type(self).__name__
+        if self.arm is None:
+            raise InputError(f"{name}: plans the whole arm; pass arm=ArmModel.load(...)")
+        self._arm = self.arm
+        self._period = 1.0 / finite_number(rate, f"{name}: rate", "Hz", above=0.0)
+        self._planning_time = finite_number(planning_time, f"{name}: planning_time", "s", at_least=0.0)
+        self._hold = finite_number(hold, f"{name}: hold", "s", above=0.0)
+        self._gain = finite_number(gain, f"{name}: gain", "1/s", above=0.0)
+        self._arrival = finite_number(arrival, f"{name}: arrival", "m", above=0.0)
+        self._margin: dict[str, Any] = {"margin": margin, "margin_horizon": margin_horizon}
+        margins_in(Scene(), **self._margin)
+        self._options: dict[str, Any] = {
+            "arm": self._arm,
+            "clearance": self.clearance,
+            "forbidden": self.forbidden,
+            "max_tilt": max_tilt,
+            "goal_tilt": goal_tilt,
+            "allowance": finite_number(allowance, f"{name}: allowance", "m", at_least=0.0),
+            "hold": self._hold,
+            **self._margin,
+        }
+        self._path = ComponentPath.of_skill(skill, pinned=pinned)
+        self.evasion = RCAMO(
+            skill,
+            tool_spheres=self._arm.tool_spheres if self.tool_spheres is None else self.tool_spheres,
+            clearance=self.clearance,
+            forbidden=self.forbidden,
+            margin=margin,
+        )
+        self._started = False
+
+    # ----- start
+
+    def reset(self, observation: Observation) -> None:
+        """Plan the whole motion from the measured posture.
+
+        Raises:
+            InfeasibleError: when the motion is impossible because of standing obstacles, or because the arm can't do
+                it; the message says why.
+        """
+        self.plans = self.certified = 0
+        self._goal = observation.scene.goal
+        self._plan: PlanInExecution | None = None
+        self._next_plan: PlanInExecution | None = None
+        self._last: PlanInExecution | None = None
+        self._base: PlanInExecution | None = None
+        self._stopping: _Stopping | None = None
+        self._evades, self._attempts = False, _SOME
+        self._learned, self._reason, self._since = 0.0, "", observation.time
+        self._due = observation.time + self._period
+        self.evasion.reset(observation)
+        self._started = True
+        begins = observation.time + self._planning_time
+        scene = observation.scene.now(begins)
+        found = self._adapted(observation.state, scene, None)
+        if found.feasible:
+            self._plan = self._begun(found, begins, 0.0, scene)
+            return
+        standing = [o for o in scene.obstacles if np.linalg.norm(o.velocity) < _STANDING]
+        alone = found
+        if len(standing) < len(scene.obstacles):
+            alone = self._adapted(observation.state, replace_obstacles(scene, standing), None)
+        if not alone.feasible:
+            raise InfeasibleError(alone.reason)
+        if not alone.moved.any():
+            self._base = self._begun(alone, begins, 0.0, replace_obstacles(scene, standing))
+        self._reason = found.reason
+
+    def _adapted(self, state: ArmState, scene: Scene, max_attempts: int | None) -> Adaptation:
+        """Plan the whole motion from rest."""
+        self.plans += 1
+        tool = self._arm.tool_pose(state.q)
+        away = tool.error_to(self.skill.start_)
+        away = away if self.skill.gmr_.has_orientation_ else away[:3]
+        start = None if np.linalg.norm(away) <= _SAME_START else tool
+        path = self._path.between(self.skill, start, scene.goal)
+        found = adapt(path, scene, state=state, max_attempts=max_attempts, **self._options)
+        self.plan = found
+        return found
+
+    def _begun(self, found: Adaptation, began: float, offset: float, scene: Scene) -> PlanInExecution:
+        self.certified += 1
+        margins = margins_in(scene, **self._margin)
+        begun = PlanInExecution.of(self._arm, found, began, offset, scene, margins, self.clearance)
+        if self._base is None and not found.moved.any():
+            self._base = begun
+        return begun
+
+    # ----- each step
+
+    def step(self, observation: Observation, dt: float) -> Command:
+        """Return the command that follows the certified plan, or brakes, or evades.
+
+        Raises:
+            InputError: when ``reset`` was not called, or the goal has moved.
+        """
+        if not self._started:
+            raise InputError("CertifiedRCAMO.step: call reset(observation) first")
+        time, scene = observation.time, observation.scene.now(observation.time)
+        self._check_goal(scene)
+        if self._next_plan is not None and time >= self._next_plan.began - 0.5 * dt:
+            self._follow(self._next_plan)
+            self._next_plan = None
+        void = self._void(observation, scene)
+        if (void or time >= self._due - 0.5 * dt) and self._next_plan is None:
+            self._due = max(self._due + self._period, time + 0.5 * self._period)
+            self._replan(observation, scene)
+            if self._plan is None:
+                self._brake(observation, scene)
+        return self._command(observation, dt)
+
+    def _check_goal(self, scene: Scene) -> None:
+        goal, first = scene.goal, self._goal
+        if goal is first or (goal is not None and first is not None and np.abs(goal.error_to(first)).max() <= STILL):
+            return
+        raise InputError(
+            "CertifiedRCAMO: the goal has moved, and certified plans have a fixed goal; use policy 'rcamo'"
+        )
+
+    def _follow(self, plan: PlanInExecution) -> None:
+        self._plan, self._stopping, self._evades, self._reason = plan, None, False, ""
+        self._attempts = _SOME
+
+    def _void(self, observation: Observation, scene: Scene) -> bool:
+        """Give up the plan if its certificate is void; return whether it was."""
+        plan = self._plan
+        if plan is None:
+            return False
+        time = observation.time
+        late = plan.off_schedule(
+            self._arm, time, observation.state, observation.tool_to_base, 0.5 * max(self.clearance, 0.01)
+        )
+        reason = late or plan.unforeseen(scene)
+        if not reason:
+            self._learned = plan.learned_at(time)
+            return False
+        self._last, self._plan, self._reason, self._since = plan, None, reason, time
+        self._next_plan = None
+        return True
+
+    def _replan(self, observation: Observation, scene: Scene) -> None:
+        """Make a new plan; follow it if it is certified."""
+        time = observation.time
+        then = time + self._planning_time
+        ahead, state = scene.now(then), self._state_at(then, observation)
+        plan = self._plan or self._last
+        if self._plan is not None and self._plan.end - then < _LAST:
+            return
+        resting = float(np.abs(state.velocity).max()) < _STANDS
+        learned = self._learned if self._plan is None else self._plan.learned_at(then)
+        if plan is None or (learned == 0.0 and resting and self._plan is None):
+            if not resting:
+                return
+            found, learned = self._adapted(state, ahead, self._attempts), 0.0
+        else:
+            found = self._replanned(plan, learned, state, ahead, self._attempts if resting and not self._plan else 1)
+        if not found.feasible:
+            if self._plan is None:
+                self._reason = found.reason
+                if resting:  # there is time to search more thoroughly, and less often
+                    self._attempts, self._due = min(self._attempts + 1, _MOST), self._due + self._period
+            return
+        new = self._begun(found, then, learned, ahead)
+        if self._planning_time > 0.0:
+            self._next_plan = new
+        else:
+            self._follow(new)
+
+    def _replanned(
+        self, plan: PlanInExecution, learned: float, state: ArmState, scene: Scene, attempts: int
+    ) -> Adaptation:
+        """Plan the rest of the motion, sometimes along the learned path again, otherwise along the last plan."""
+        options: dict[str, Any] = {**self._options, "max_attempts": attempts}
+        base, self.plans = self._base, self.plans + 1
+        if base is not None and base is not plan and plan.adaptation.moved.any() and self.plans % _BACK == 0:
+            phase = base.phase_of(learned)
+            if phase < base.adaptation.trajectory.times[-1]:
+                found = replan(base.adaptation, scene, state=state, phase=phase, **options)
+                if found.feasible and not found.moved.any():
+                    return found
+        last = plan.adaptation.trajectory.times[-1]
+        phase = min(plan.phase_of(learned), float(last) - 1e-3)
+        return replan(plan.adaptation, scene, state=state, phase=phase, **options)
+
+    def _state_at(self, time: float, observation: Observation) -> ArmState:
+        """Return the state of the arm, predicted for a time at or after the observation."""
+        now, ahead = observation.state, time - observation.time
+        if ahead == 0.0:
+            return now
+        if self._plan is not None:
+            error = now.q - self._plan.joints_at(observation.time)
+            return replace(now, q=self._plan.joints_at(time) + error, velocity=self._plan.velocity_at(time))
+        if self._stopping is not None:
+            later = self._stopping.joints_at(time)
+            return replace(now, q=later, velocity=(self._stopping.joints_at(time + 1e-3) - later) / 1e-3)
+        q = np.clip(now.q + ahead * now.velocity, self._arm.lower, self._arm.upper)
+        return replace(now, q=q)
+
+    def _brake(self, observation: Observation, scene: Scene) -> None:
+        """Brake to rest, if this is certified; otherwise evade."""
+        stop = certified_stop(
+            self._arm, observation.state, scene, clearance=self.clearance, horizon=self._hold + 0.5, **self._margin
+        )
+        if stop.certified:
+            self._stopping, self._evades = _Stopping(stop, observation.time), False
+            return
+        self._stopping = None
+        if not self._evades:
+            self.evasion.resume(observation, min(self._learned / self.skill.duration_, 1.0))
+            self._evades = True
+
+    # ----- commands
+
+    def _command(self, observation: Observation, dt: float) -> Command:
+        if self._plan is not None:
+            return self._along(self._plan, observation)
+        if self._evades:
+            return self._evasive(observation, dt)
+        return self._braking(observation)
+
+    def _along(self, plan: PlanInExecution, observation: Observation) -> Command:
+        time = observation.time
+        velocity = plan.velocity_at(time) + self._gain * (plan.joints_at(time) - observation.state.q)
+        twist = self._arm.jacobian(observation.state.q) @ velocity
+        progress = min(plan.learned_at(time) / self.skill.duration_, 1.0)
+        if plan.waits_at(time):
+            reason = "the plan waits until an obstacle has passed"
+            return Command(twist, velocity, progress=progress, status=Status.WAITING, reason=reason)
+        displaced = plan.displacement_at(time)
+        if displaced:
+            reason = f"the path is displaced by {1e3 * displaced:.0f} mm here because of an obstacle"
+            return Command(twist, velocity, progress=progress, status=Status.AVOIDING, reason=reason)
+        return Command(twist, velocity, progress=progress)
+
+    def _evasive(self, observation: Observation, dt: float) -> Command:
+        command = self.evasion.step(observation, dt)
+        self._learned = max(self.evasion.phase * self.skill.duration_, 1e-6)
+        reason = f"no certified plan ({self._reason}), so the arm evades; {command.reason or 'on its path'}"
+        status = Status.AVOIDING if command.status is Status.NOMINAL else command.status
+        return replace(command, status=status, reason=reason)
+
+    def _braking(self, observation: Observation) -> Command:
+        time, n = observation.time, self._arm.n_joints
+        velocity = np.zeros(n)
+        if self._stopping is not None:
+            ahead = self._stopping.joints_at(time)
+            velocity = (self._stopping.joints_at(time + 1e-3) - ahead) / 1e-3 + self._gain * (
+                ahead - observation.state.q
+            )
+        twist = self._arm.jacobian(observation.state.q) @ velocity
+        stands = float(np.abs(observation.state.velocity).max()) < _STANDS
+        reason = f"no certified plan since {self._since:.1f} s: {self._reason}"
+        status = Status.WAITING if stands else Status.BRAKING
+        progress = min(self._learned / self.skill.duration_, 1.0)
+        return Command(twist, velocity, progress=progress, status=status, reason=reason)
+
+    def finished(self, observation: Observation) -> bool:
+        """Return whether the plan has ended, and the tool is nearer than ``arrival`` to the goal."""
+        if not self._started:
+            return False
+        goal = self.skill.goal_ if observation.scene.goal is None else observation.scene.goal
+        if np.linalg.norm(observation.tool_to_base.position - goal.position) >= self._arrival:
+            return False
+        if self._plan is not None:
+            return observation.time >= self._plan.end
+        return self._evades and self.evasion.finished(observation)
+
+
+def replace_obstacles(scene: Scene, obstacles: Any) -> Scene:
+    """Return a scene with other obstacles."""
+    return Scene(scene.goal, obstacles, scene.stamp, scene.fixtures)

@@ -1,0 +1,202 @@
+r"""PlanInExecution: a certified plan that an arm follows on time, and the check that its assumptions still hold.
+
+The certificate of a plan assumes that the arm is on schedule, and that each obstacle i is within its margin of where
+the plan predicted it. With the certified clearance :math:`c_0 \ge c`, an obstacle may be farther away from there:
+
+.. math:: |p_i(t) - \hat p_i(t)| + r_i \, |\theta_i(t)| + s_i(t) \le m_i(t) + c_0 - c
+
+Here :math:`p_i` is the position as seen now, :math:`\hat p_i` the position that the plan predicted for now,
+:math:`r_i` the radius of a sphere that contains the obstacle, :math:`\theta_i` the angle between the seen and the
+predicted rotation, and :math:`s_i` the growth of the largest size since then. Then the distance is still at least c.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.kinematics.arm import ArmModel, ArmState
+from imitarm.kinematics.pose import Pose, quaternion_conjugate, quaternion_log, quaternion_multiply
+from imitarm.policies.adapted_path import Adaptation
+from imitarm.policies.prediction_margin import PredictionMargin
+from imitarm.scene.scene import Scene
+from imitarm.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+_ROUNDING = 1e-6  # [m]
+_STANDS = 0.05  # rate of the motion below which it waits
+_DISPLACED = 1e-3  # [m] from the learned path: less is not called avoiding
+
+
+@dataclass(frozen=True, eq=False)
+class PlanInExecution:
+    """A certified plan of the whole arm, and when it began.
+
+    Attributes:
+        adaptation: the plan.
+        began: time of its first sample [s].
+        offset: time in the learned motion at which the plan begins [s].
+        scene: the obstacles that the plan assumed, at the time ``began``.
+        margins: the margin of each of these obstacles; None for an obstacle without one.
+        clearance: required clearance [m].
+        approach: duration of the motion to the first posture of the path [s]; it is part of the plan.
+        trajectory: the tool's path of the whole motion, from time 0.
+        joints: the joint positions at its samples, shape (n, n_joints) [rad].
+    """
+
+    adaptation: Adaptation
+    began: float
+    offset: float
+    scene: Scene
+    margins: Sequence[PredictionMargin | None]
+    clearance: float
+    approach: float
+    trajectory: Trajectory
+    joints: Array
+
+    @classmethod
+    def of(
+        cls,
+        arm: ArmModel,
+        adaptation: Adaptation,
+        began: float,
+        offset: float,
+        scene: Scene,
+        margins: Sequence[PredictionMargin | None],
+        clearance: float,
+    ) -> PlanInExecution:
+        """Return the plan; its arguments are the attributes of the same names."""
+        path, joints, approach = adaptation.trajectory, adaptation.joints, adaptation.approach
+        assert joints is not None
+        lead = 0.0
+        if approach is not None:
+            lead = float(approach.times[-1])
+            positions, quaternions = arm.tool_path(approach.joints[:-1])
+            path = Trajectory(
+                np.concatenate([approach.times[:-1], lead + path.times]),
+                np.concatenate([positions, path.positions]),
+                None if path.quaternions is None else np.concatenate([quaternions, path.quaternions]),
+            )
+            joints = np.concatenate([approach.joints[:-1], joints])
+        return cls(adaptation, began, offset, scene, margins, clearance, lead, path, joints)
+
+    @property
+    def end(self) -> float:
+        """Time at which the arm is at the goal [s]."""
+        return self.began + float(self.trajectory.times[-1])
+
+    @cached_property
+    def _velocities(self) -> Array:
+        return np.gradient(self.joints, self.trajectory.times, axis=0)
+
+    def joints_at(self, time: float) -> Array:
+        """Return the planned joint positions at a time [s], shape (n_joints,) [rad]."""
+        return _at(time - self.began, self.trajectory.times, self.joints)
+
+    def velocity_at(self, time: float) -> Array:
+        """Return the planned joint velocities at a time [s], shape (n_joints,) [rad/s]; 0 after the end."""
+        if time >= self.end:
+            return np.zeros(self.joints.shape[1])
+        return _at(time - self.began, self.trajectory.times, self._velocities)
+
+    def phase_at(self, time: float) -> float:
+        """Return the phase at a time [s], as :func:`~imitarm.policies.replan` counts it [s]."""
+        return max(time - self.began - self.approach, 0.0)
+
+    def learned_at(self, time: float) -> float:
+        """Return the time in the learned motion that the plan has reached at a time [s]."""
+        done, learned = self.adaptation.trajectory.times, self.adaptation.nominal.times
+        return self.offset + float(np.interp(self.phase_at(time), done, learned))
+
+    def phase_of(self, learned: float) -> float:
+        """Return the phase at a time in the learned motion; the inverse of :meth:`learned_at` [s]."""
+        done, times = self.adaptation.trajectory.times, self.adaptation.nominal.times
+        return float(np.interp(learned - self.offset, times, done))
+
+    def waits_at(self, time: float) -> bool:
+        """Return whether the plan lets the arm wait at a time [s]."""
+        done, learned = self.adaptation.trajectory.times, self.adaptation.nominal.times
+        phase = self.phase_at(time)
+        i = int(np.clip(np.searchsorted(done, phase, side="right"), 1, len(done) - 1))
+        return bool(phase < done[-1] and learned[i] - learned[i - 1] < _STANDS * (done[i] - done[i - 1]))
+
+    def displacement_at(self, time: float) -> float:
+        """Return the distance of the planned path from the learned path at a time [s], 0 if it is negligible [m]."""
+        plan = self.adaptation
+        away = np.linalg.norm(plan.trajectory.positions - plan.nominal.positions, axis=1)
+        displaced = float(np.interp(self.phase_at(time), plan.trajectory.times, away))
+        return displaced if displaced > _DISPLACED else 0.0
+
+    def off_schedule(self, arm: ArmModel, time: float, state: ArmState, tool: Pose, patience: float) -> str:
+        """Return why the arm is not on schedule; empty if it is.
+
+        Args:
+            arm: the arm.
+            time: now [s].
+            state: measured state of the arm.
+            tool: measured pose of the tool.
+            patience: accepted error of the tool's position [m].
+        """
+        lag = float(np.linalg.norm(arm.tool_pose(self.joints_at(time)).position - tool.position))
+        if lag > patience:
+            return f"the tool is {1e3 * lag:.0f} mm from where it should be at {time:.2f} s"
+        return ""
+
+    def unforeseen(self, scene: Scene) -> str:
+        """Return how the obstacles differ from what the plan assumed; empty if the certificate holds for them.
+
+        Args:
+            scene: the obstacles as seen now; its stamp is now.
+        """
+        seen = scene.packed
+        if not len(seen):
+            return ""
+        predicted = self.scene.at(scene.stamp)
+        index = _matches(predicted, scene)
+        new = np.flatnonzero(index < 0)
+        if len(new):
+            return f"{scene.name_of(new[0])} is new"
+        then = predicted.packed
+        away = np.linalg.norm(seen.positions - then.positions[index], axis=1)
+        away += np.abs(seen.sizes - then.sizes[index]).max(axis=1)
+        turn = quaternion_log(quaternion_multiply(seen.quaternions, quaternion_conjugate(then.quaternions[index])))
+        radii = np.where(np.isfinite(seen.radii), seen.radii, 0.0)
+        rotating = then.angular_velocities[index].any(axis=1)
+        away += np.where(rotating, 0.0, radii * np.linalg.norm(turn, axis=1))
+        allowed = self._allowed(scene.stamp)[index]
+        worst = int(np.argmax(away - allowed))
+        if away[worst] <= allowed[worst]:
+            return ""
+        return (
+            f"{scene.name_of(worst)} is {1e3 * away[worst]:.0f} mm from where it was predicted "
+            f"({1e3 * allowed[worst]:.0f} mm allowed)"
+        )
+
+    def _allowed(self, time: float) -> Array:
+        """Return the allowed error of each obstacle of the plan at a time [s], shape (n,) [m]."""
+        spare = max(self.adaptation.certified_clearance - self.clearance, 0.0)
+        margins = [0.0 if m is None else float(m.at(np.array(time - self.began))) for m in self.margins]
+        return np.array(margins) + (min(spare, 1.0) + _ROUNDING)
+
+
+def _matches(before: Scene, now: Scene) -> NDArray[np.intp]:
+    """Return the index in ``before`` of each obstacle of ``now``: the same track, or else the same name and shape."""
+    known = {_key(before, i): i for i in range(len(before.packed))}
+    return np.array([known.get(_key(now, i), -1) for i in range(len(now.packed))], dtype=np.intp)
+
+
+def _key(scene: Scene, i: int) -> tuple[int, str]:
+    track = int(scene.packed.track_ids[i])
+    return (track, "") if track >= 0 else (-1, scene.name_of(i))
+
+
+def _at(time: float, times: Array, values: Array) -> Array:
+    """Return the row at ``time``, shape (m,), interpolated linearly between the rows of ``values`` (n, m)."""
+    i = int(np.clip(np.searchsorted(times, time, side="right"), 1, len(times) - 1))
+    share = min(max((time - times[i - 1]) / (times[i] - times[i - 1]), 0.0), 1.0)
+    return np.asarray(values[i - 1] + share * (values[i] - values[i - 1]))

@@ -1,0 +1,114 @@
+r"""certified_stop: brake a moving arm to rest and hold it there, with a certificate for both.
+
+All joints brake together, with the constant deceleration that the slowest joint allows. In joint space, the arm then
+moves on a straight line, and it stops after the time
+
+.. math:: t_b = \max_j \frac{|\dot q_j|}{a_j} .
+
+The posture in which the arm stops is held until the end of the horizon. The certificate of the whole arm
+(:mod:`~imitarm.policies.arm_certificate`) covers both parts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.errors import InputError
+from imitarm.kinematics.arm import ArmModel, ArmState
+from imitarm.kinematics.arm_path import ArmPath
+from imitarm.perception.margins import CoverageMargin
+from imitarm.policies.arm_certificate import ArmAmongObstacles
+from imitarm.policies.arm_pairs import SELF
+from imitarm.policies.prediction_margin import margins_in
+from imitarm.policies.whole_arm import links_apart
+from imitarm.scene.scene import Scene
+from imitarm.validation import finite_number, instance
+
+Array = NDArray[np.float64]
+
+_DECELERATION = 0.8  # of the largest one
+_SAMPLES = 9  # while the arm brakes
+_STANDS = 1e-4  # [rad/s]
+
+
+@dataclass(frozen=True, eq=False)
+class Stop:
+    """A motion that ends at rest, and its certificate.
+
+    Attributes:
+        times: from 0 to the end of the horizon, shape (n,) [s].
+        joints: joint positions, shape (n, n_joints) [rad]; linear between the samples.
+        clearance: guaranteed lower bound of the clearance of the whole arm [m], or, if ``certified`` is False, a
+            measured clearance that is too small.
+        certified: whether the whole arm keeps its clearances until the end of the horizon.
+        reason: what comes too close; empty if ``certified``.
+    """
+
+    times: Array
+    joints: Array
+    clearance: float
+    certified: bool
+    reason: str
+
+
+def certified_stop(
+    arm: ArmModel,
+    state: ArmState,
+    scene: Scene,
+    *,
+    clearance: float = 0.02,
+    horizon: float = 1.0,
+    margin: CoverageMargin | None = None,
+    margin_horizon: float | None = None,
+) -> Stop:
+    """Return the motion that brakes the arm to rest and holds it, with its certificate.
+
+    Args:
+        arm: the arm with its tool.
+        state: measured state of the arm.
+        scene: obstacles now, with their velocities.
+        clearance: required distance from the whole arm to every obstacle [m].
+        horizon: time for which the certificate holds, from now [s].
+        margin: bound of the error with which obstacles are predicted; see :func:`~imitarm.policies.adapt`.
+        margin_horizon: see :func:`~imitarm.policies.adapt` [s].
+
+    Raises:
+        InputError: when an argument is not valid.
+    """
+    instance(arm, ArmModel, "arm")
+    q, velocity = instance(state, ArmState, "state").q, state.velocity
+    if len(q) != arm.n_joints:
+        raise InputError(f"certified_stop: state has {len(q)} joints, but {arm.name} has {arm.n_joints}")
+    instance(scene, Scene, "scene")
+    clearance = finite_number(clearance, "clearance", "m", at_least=0.0)
+    horizon = finite_number(horizon, "horizon", "s", above=0.0)
+    times, joints = _braking(q, velocity, _DECELERATION * arm.max_acceleration, horizon)
+    around = ArmAmongObstacles(
+        arm,
+        scene.obstacles,
+        clearance,
+        own=links_apart(arm),
+        margins=margins_in(scene, margin, margin_horizon),
+    )
+    found = around.clearance_of(ArmPath.of(arm, joints), times)
+    reason = ""
+    if found.room < 0.0:
+        what = "another link" if found.obstacle == SELF else scene.name_of(found.obstacle)
+        within = times[min(found.sample + 1, len(times) - 1)]
+        reason = f"{arm.cover.bodies[found.sphere]} comes too close to {what} within {within:.2f} s"
+    return Stop(times, joints, clearance + found.room, found.room >= 0.0, reason)
+
+
+def _braking(q: Array, velocity: Array, deceleration: Array, horizon: float) -> tuple[Array, Array]:
+    """Return times (n,) [s] and joint positions (n, n_joints) [rad] of a stop and the rest after it."""
+    if np.abs(velocity).max() < _STANDS:
+        return np.array([0.0, horizon]), np.stack([q, q])
+    duration = float((np.abs(velocity) / deceleration).max())
+    times = np.linspace(0.0, duration, _SAMPLES)
+    joints = q + np.outer(times - 0.5 * times**2 / duration, velocity)
+    if horizon > duration:
+        times, joints = np.append(times, horizon), np.concatenate([joints, joints[-1:]])
+    return times, joints
