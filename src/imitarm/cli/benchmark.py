@@ -34,6 +34,7 @@ OTHERS = (
     "imitarm.cli.benchmark_static:add_static",
     "imitarm.cli.benchmark_tracking:add_tracking",
     "imitarm.cli.benchmark_perception:add_perception",
+    "imitarm.cli.benchmark_moving:add_moving",
 )
 """Benchmarks with a file of their own: the functions that add their parsers."""
 
@@ -55,6 +56,8 @@ examples:
   imitarm benchmark static compare static --report static.html
   imitarm benchmark tracking --data recordings --report tracking.html
   imitarm benchmark perception --count 105
+  imitarm benchmark moving --count 100 --out moving
+  imitarm benchmark moving compare moving --report moving.html
 
 'mapping' saves each result in the folder --out, and 'placements' in the file --out.
 If one of them was interrupted, the same command continues where it stopped.

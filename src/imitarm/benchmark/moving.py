@@ -1,0 +1,207 @@
+"""The avoidance benchmark among moving obstacles: one experiment is one method in one scene, with one sensor.
+
+``MovingExperiment("M1", 3, 2000, "rcamo").run()`` makes the scene, lets the method move the tool among obstacles that a
+tracker reports, and measures the motion against the true obstacles.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from imitarm.benchmark.moving_arm import ROBOTS, arm_case, prepared, run_arm
+from imitarm.benchmark.moving_controls import CONTROLS, control
+from imitarm.benchmark.moving_measures import OUTCOMES, SUCCESSES, measured
+from imitarm.benchmark.moving_scenes import FAMILIES, MovingCase, moving_case
+from imitarm.benchmark.moving_world import ToolRun, run_tool
+from imitarm.benchmark.provenance import code_version
+from imitarm.control_loop.observer import SensorModel, TrackedScene
+from imitarm.errors import ImitarmError, InputError, UnknownNameError
+from imitarm.perception import ObstacleTracker
+from imitarm.policies import POLICIES, Policy
+
+Options = tuple[tuple[str, float | str], ...]
+
+OURS = ("rcamo", "rcamo-certified")
+"""Our methods."""
+WORLDS = ("tool", *ROBOTS)
+"""Worlds: the tool alone, and two arms."""
+_PLAN_JOINTS = ("rrt-connect", "rrt-connect-tilt", "rcamo-certified")  # these need an arm
+_PLAN_ONCE = ("elastic-band", "tp-gmm")  # the first plans once; the second differs from gmm-dmp at other ends only
+
+
+def method_names(world: str = "tool") -> tuple[str, ...]:
+    """Return the names of all methods in a world: the controls, and the policies that can move there."""
+    if world == "tool":
+        return (*CONTROLS, *(name for name in POLICIES if name not in _PLAN_JOINTS))
+    return (CONTROLS[0], *POLICIES)
+
+
+def default_methods(world: str = "tool") -> tuple[str, ...]:
+    """Return the methods that are compared by default; the oracle with tracks takes too long."""
+    if world != "tool":
+        return (CONTROLS[0], *OURS, "acfra", "dmp-potential", "barrier", "modulation")
+    return tuple(name for name in method_names() if name not in (*_PLAN_ONCE, "oracle-tracks"))
+
+
+def build(method: str, case: MovingCase, options: Options = (), world: str = "tool") -> Policy:
+    """Return a method for a scene, with options that replace its defaults; with an arm, it may also plan the joints.
+
+    Raises:
+        UnknownNameError: when there is no such method.
+        InputError: when the method does not take an option.
+    """
+    if method not in method_names(world):
+        raise UnknownNameError.among("method", method, method_names(world))
+    known: dict[str, Any] = {
+        "tool_spheres": case.tool_spheres,
+        "clearance": case.clearance,
+        "forbidden": case.forbidden,
+        **dict(options),
+    }
+    if world != "tool":
+        arm = prepared(world)[1]
+        known.update(arm=arm, tool_spheres=arm.tool_spheres)
+    if method in CONTROLS:
+        return control(method, case, **known)
+    return POLICIES[method].build(case.skill, **known)
+
+
+@dataclass(frozen=True)
+class MovingExperiment:
+    """One method in one scene with one sensor; plain values that can be sent to another process or machine.
+
+    Attributes:
+        family: one of :data:`~imitarm.benchmark.moving_scenes.FAMILIES`.
+        dimension: 2 when the path may only be displaced horizontally, else 3.
+        seed: number of the scene, and of the sensor's errors.
+        method: one of :func:`method_names`.
+        options: options that replace the defaults of the method.
+        world: one of :data:`WORLDS`: the tool alone, or the whole arm, which only moves in 3-D.
+        noise: standard deviation of the sensor (:class:`~imitarm.control_loop.SensorModel`) [m].
+        rate: rate of the sensor [Hz].
+        latency: delay of the sensor [s].
+        dropout: probability that an obstacle is missed in a frame.
+        occlusions: rate of occlusions [1/s].
+
+    Raises:
+        UnknownNameError: when family or method is not known.
+        InputError: when a number is out of range.
+    """
+
+    family: str
+    dimension: int
+    seed: int
+    method: str = "rcamo"
+    options: Options = ()
+    world: str = "tool"
+    noise: float = 0.005
+    rate: float = 30.0
+    latency: float = 0.033
+    dropout: float = 0.0
+    occlusions: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.family not in FAMILIES:
+            raise UnknownNameError.among("family", self.family, FAMILIES)
+        if self.dimension not in (2, 3) or self.seed < 0:
+            raise InputError(
+                f"MovingExperiment: dimension must be 2 or 3 and seed at least 0, got {self.dimension} and {self.seed}"
+            )
+        if self.world not in WORLDS:
+            raise UnknownNameError.among("world", self.world, WORLDS)
+        if self.world != "tool" and self.dimension != 3:
+            raise InputError(f"MovingExperiment: the world {self.world!r} needs dimension 3, got {self.dimension}")
+        if self.method not in method_names(self.world):
+            raise UnknownNameError.among(f"method in the world {self.world!r}", self.method, method_names(self.world))
+        _ = self.sensor  # its checks
+        object.__setattr__(self, "options", tuple(sorted((str(k), v) for k, v in self.options)))
+
+    @property
+    def sensor(self) -> SensorModel:
+        """The sensor."""
+        return SensorModel(self.noise, self.rate, self.latency, self.dropout, self.occlusions, seed=self.seed)
+
+    @property
+    def scene(self) -> tuple[str, int, int]:
+        """What experiments of different methods in the same scene have in common."""
+        return self.family, self.dimension, self.seed
+
+    def case(self) -> MovingCase:
+        """Return the scene."""
+        if self.world != "tool":
+            return arm_case(self.world, self.family, self.seed)
+        return moving_case(self.family, self.dimension, self.seed)
+
+    def moved(self) -> tuple[MovingCase, ToolRun]:
+        """Return the scene and the motion of the tool alone, for measuring and drawing."""
+        case = self.case()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of numerical methods in hard scenes: the motion is measured anyway
+            observe = TrackedScene(case.truth, self.sensor, ObstacleTracker())
+            return case, run_tool(build(self.method, case, self.options), case, observe)
+
+    def run(self) -> MovingResult:
+        """Let the method move the tool in its scene, and measure the motion.
+
+        Returns:
+            The result. An error of the method is the outcome "failed"; the reason says which one.
+        """
+        values: dict[str, Any] = {}
+        try:
+            if self.world == "tool":
+                case, run = self.moved()
+                found, reason, values = measured(case, run)
+            else:
+                case = self.case()
+                policy = build(self.method, case, self.options, self.world)
+                found, reason, values = run_arm(policy, case, self.world, self.sensor)
+            values["n_obstacles"] = len(case.truth.scene.obstacles)
+            values["touched"] = case.touched
+        except (ImitarmError, ArithmeticError, ValueError, TypeError, LookupError, np.linalg.LinAlgError) as error:
+            found, reason = "failed", f"{type(error).__name__}: {error}"
+        return MovingResult(self, code_version(), found, reason, values)
+
+
+@dataclass(frozen=True, eq=False)
+class MovingResult:
+    """The result of an experiment, as plain values.
+
+    Attributes:
+        experiment: the experiment that was run.
+        code: version of the code that ran, see :func:`~imitarm.benchmark.provenance.code_version`.
+        outcome: one of :data:`~imitarm.benchmark.moving_measures.OUTCOMES`.
+        reason: explanation of the outcome; empty after a success.
+        values: measures by name, see :func:`~imitarm.benchmark.moving_measures.measured`; ``n_obstacles``; ``touched``,
+            the time at which the tool of the learned motion touches an obstacle [s].
+    """
+
+    experiment: MovingExperiment
+    code: str
+    outcome: str
+    reason: str
+    values: Mapping[str, Any]
+
+    def __post_init__(self) -> None:
+        if self.outcome not in OUTCOMES:
+            raise UnknownNameError.among("outcome", self.outcome, OUTCOMES)
+
+    @property
+    def success(self) -> bool:
+        """Whether nothing was touched and the goal was reached in time."""
+        return self.outcome in SUCCESSES
+
+    def value(self, name: str) -> float:
+        """Return the measure with this name; nan when it is unknown."""
+        found = self.values.get(name)
+        return math.nan if found is None else float(found)
+
+
+def run_experiment(experiment: MovingExperiment) -> MovingResult:
+    """Run an experiment; a function for worker processes."""
+    return experiment.run()

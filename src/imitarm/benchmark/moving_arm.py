@@ -1,0 +1,179 @@
+"""The world of the moving benchmark with a whole arm: a simulated robot, its safety filter, and the same sensor."""
+
+from __future__ import annotations
+
+import time as clock
+from dataclasses import asdict
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.benchmark.moving_measures import Contact, motion_measures, tracking
+from imitarm.benchmark.moving_scenes import LONGEST, MovingCase, distances_in_time, moving_case
+from imitarm.benchmark.moving_world import DT, Seen, ToolRun
+from imitarm.benchmark.static_measures import AT_GOAL, LATEST, SLACK
+from imitarm.command import Command
+from imitarm.control_loop import Step, reproduce
+from imitarm.control_loop.observer import SensorModel, TrackedScene
+from imitarm.demonstrations import align, read
+from imitarm.errors import InfeasibleError, InputError
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.arm_kinematics import find_posture
+from imitarm.kinematics.pose import Pose
+from imitarm.perception import ObstacleTracker
+from imitarm.policies.policy import Observation, Policy
+from imitarm.robots import SimulatedRobot
+from imitarm.safety import SafetyFilter
+from imitarm.skills import Skill
+from imitarm.tasks.sweep import DEMONSTRATIONS
+from imitarm.trajectory import Rollout
+
+Array = NDArray[np.float64]
+
+ROBOTS = {"sawyer": "brush", "panda": "gripper"}
+"""Arms, and their tools."""
+_SPARE = 0.01  # [m] beyond the required clearance, at the start and at the goal
+_STILL = 0.05  # [rad/s] joints slower than this stand
+
+
+@lru_cache(maxsize=4)
+def prepared(robot: str) -> tuple[Skill, ArmModel, Array]:
+    """Return the skill 'sweep' of the package, the arm with its tool, and the start posture."""
+    skill, arm = Skill().fit(align(read(DEMONSTRATIONS))), ArmModel.load(robot, tool=ROBOTS[robot])
+    rotation = arm.tool_pose(arm.home).quaternion
+    end = skill.start_
+    start = find_posture(arm, Pose(end.position, end.quaternion if skill.gmr_.has_orientation_ else rotation))
+    return skill, arm, start
+
+
+def arm_case(robot: str, family: str, seed: int) -> MovingCase:
+    """Return a scene around the sweep of an arm that leaves the arm free at the start, and its tool at the goal.
+
+    A seed whose scene does not is replaced by a seed that is 10 000 larger.
+
+    Raises:
+        InputError: when no scene is found.
+    """
+    skill, arm, start = prepared(robot)
+    centers, radii = arm.collision_spheres(start)
+    goal = skill.goal_ if skill.gmr_.has_orientation_ else Pose(skill.goal_.position, arm.tool_pose(start).quaternion)
+    tool = goal.apply(arm.tool_spheres[:, :3])
+    for number in range(seed, seed + 200_000, 10_000):
+        case = moving_case(family, 3, number, skill=skill)
+        early = _least_gap(case, np.linspace(-0.5, 0.3, 9), centers, radii)
+        late = _least_gap(case, skill.duration_ * np.linspace(1.0, LONGEST, 15), tool, arm.tool_spheres[:, 3])
+        if min(early, late) > case.clearance + _SPARE:
+            return case
+    raise InputError(f"{family}, seed {seed}: no scene leaves the {robot} free at the start")
+
+
+def _least_gap(case: MovingCase, times: Array, centers: Array, radii: Array) -> float:
+    """Return the smallest gap of standing spheres to the obstacles [m]."""
+    gaps = [
+        distances_in_time(case.truth, times, np.broadcast_to(c, (len(times), 3))).min() - r
+        for c, r in zip(centers, radii, strict=True)
+    ]
+    return float(min(gaps))
+
+
+class _Timed(Policy):
+    """A policy whose steps are timed."""
+
+    def __init__(self, policy: Policy, run: ToolRun) -> None:
+        self._policy, self._run = policy, run
+
+    def reset(self, observation: Observation) -> None:
+        """Time the reset."""
+        began = clock.perf_counter()
+        self._policy.reset(observation)
+        self._run.reset_seconds = clock.perf_counter() - began
+
+    def step(self, observation: Observation, dt: float) -> Command:
+        """Time a step, and note what was observed."""
+        began = clock.perf_counter()
+        command = self._policy.step(observation, dt)
+        self._run.step_seconds.append(clock.perf_counter() - began)
+        self._run.statuses.append(command.status)
+        self._run.last = command
+        if len(self._run.step_seconds) % 3 == 1:
+            self._run.seen.append(Seen.of(observation.scene.now(observation.time), observation.time))
+        return command
+
+    def finished(self, observation: Observation) -> bool:
+        """Return whether the policy has finished."""
+        return self._policy.finished(observation)
+
+
+def run_arm(policy: Policy, case: MovingCase, robot: str, sensor: SensorModel) -> tuple[str, str, dict[str, Any]]:
+    """Let a policy move an arm in a scene; return outcome, explanation and measures as for the tool alone.
+
+    Clearance and contacts are those of the simulator, for the whole arm. The safety filter requires the clearance of
+    all links.
+    """
+    _, arm, start = prepared(robot)
+    body = SimulatedRobot(arm, scene=case.truth.scene, motion=case.truth.motions, q=start)
+    run, steps = ToolRun(), list[Step]()
+    safety = SafetyFilter(arm, dt=DT, clearance=case.clearance)
+    observe = TrackedScene(case.truth, sensor, ObstacleTracker())
+    try:
+        rollout = reproduce(
+            _Timed(policy, run),
+            body,
+            observe,
+            dt=DT,
+            safety=safety,
+            timeout=LATEST * case.skill.duration_,
+            on_step=steps.append,
+        )
+    except InfeasibleError as refusal:
+        return "refused", str(refusal), {"reset_seconds": run.reset_seconds}
+    return _measured(case, run, rollout, steps, body)
+
+
+def _measured(
+    case: MovingCase, run: ToolRun, rollout: Rollout, steps: list[Step], body: SimulatedRobot
+) -> tuple[str, str, dict[str, Any]]:
+    path = rollout.trajectory
+    n = round(path.duration / DT)
+    times = DT * np.arange(n + 1.0)
+    run.times, run.positions = times, path.at(np.minimum(times, path.times[-1]))[0]
+    run.arrived = rollout.reason == "finished" or rollout.reason.startswith(("clearance", "touched"))
+    gap = distances_in_time(case.truth, run.times, run.positions)
+    values: dict[str, Any] = {
+        **tracking(case, run.seen),
+        **motion_measures(case, run, run.times, gap),
+        "reset_seconds": run.reset_seconds,
+        "step_median": float(np.median(run.step_seconds)) if run.step_seconds else np.nan,
+        "step_p99": float(np.quantile(run.step_seconds, 0.99)) if run.step_seconds else np.nan,
+        "clearance": float(rollout.min_clearance),
+        "unsafe": float(rollout.details["unsafe"]),
+    }
+    pairs = sorted(" with ".join(pair) for pair in rollout.details.get("contacts", ()))
+    values["contacts"] = [asdict(_contact(pairs, steps))] if pairs else []
+    if pairs:
+        return "contact", "; ".join(pairs), values
+    if rollout.reason.startswith("not finished"):
+        return "late", rollout.reason, values
+    if not rollout.success and not rollout.reason.startswith("clearance"):
+        return "failed", rollout.reason, values
+    if values["goal_error"] > AT_GOAL:
+        return "missed goal", f"the motion ends {1e3 * values['goal_error']:.1f} mm from the goal", values
+    if values["clearance"] < case.clearance - SLACK:
+        return "too near", f"{1e3 * values['clearance']:.1f} mm instead of {1e3 * case.clearance:.0f} mm", values
+    return "success", "", values
+
+
+def _contact(pairs: list[str], steps: list[Step]) -> Contact:
+    """Return the first contact; the closing speed counts as that of the obstacle if the joints stand."""
+    gaps = np.array([step.clearance for step in steps])
+    k = int(np.argmax(gaps <= 0.0)) if (gaps <= 0.0).any() else int(np.argmin(gaps))
+    closing = float(gaps[max(k - 1, 0)] - gaps[k]) / DT if k else 0.0
+    step = steps[k]
+    stands = float(np.abs(step.state.velocity).max()) < _STILL
+    cause = "the obstacle moves into the arm" if stands else "the arm moves at the contact"
+    if not step.safety.safe:
+        cause += "; no velocity keeps all clearances"
+    speeds = (closing, 0.0) if stands else (closing, float("nan"))
+    return Contact(pairs[0], step.time, *speeds, stands, step.command.status.value, cause)

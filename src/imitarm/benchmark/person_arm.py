@@ -1,0 +1,122 @@
+"""A real person's arm as two capsules that move through the scene, from recordings (family M10)."""
+
+from __future__ import annotations
+
+import math
+import os
+from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from imitarm.benchmark.moving_motions import BEFORE
+from imitarm.benchmark.real_motions import real_motions
+from imitarm.errors import InputError
+from imitarm.kinematics.pose import quaternion_exp, quaternion_multiply, rotate
+from imitarm.scene import Capsule
+from imitarm.scene.motion import Track
+from imitarm.scene.obstacle import rotation_from_z
+
+Array = NDArray[np.float64]
+
+DATA = "IMITARM_DATA"
+"""Environment variable with the folder of real recordings."""
+_UPPER, _FORE = 0.050, 0.042  # [m] radii of the two capsules
+_STEP = 0.01  # [s]
+_SMOOTH = 0.06  # [s] standard deviation of the filter that removes the noise of the recordings
+_LEAST_SPEED = 0.1  # [m/s] of the point of the arm that meets the tool
+_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # camera frame, y up, to z up
+
+
+class _Recorded(NamedTuple):
+    """Shoulder, elbow and hand over time, shape (n, 3, 3) [m], every 10 ms, z up."""
+
+    points: Array
+
+
+@lru_cache(maxsize=2)
+def _recordings(folder: str) -> tuple[_Recorded, ...]:
+    found = []
+    for motion in real_motions(Path(folder)):
+        arms = [arm for skeleton in motion.skeletons if (arm := skeleton.arm(motion.side)).seen]
+        arms = [arm for arm in arms if np.isfinite(arm.points[3]).all()]
+        times = np.array([arm.time for arm in arms])
+        times, first = np.unique(times - times[0], return_index=True)
+        points = np.array([arm.points[[0, 1, 3]] for arm in arms])[first] @ _UP.T
+        even = np.arange(0.0, times[-1], _STEP)
+        flat = points.reshape(len(points), 9)
+        made = np.stack([np.interp(even, times, column) for column in flat.T], axis=1)
+        found.append(_Recorded(gaussian_filter1d(made, _SMOOTH / _STEP, axis=0).reshape(-1, 3, 3)))
+    return tuple(found)
+
+
+def has_recordings() -> bool:
+    """Whether the recordings of real persons are there."""
+    return (Path(os.environ.get(DATA, "")) / "mocap_arm" / "recording.tsv").is_file()
+
+
+def person_arm(
+    rng: np.random.Generator, time: float, meeting: Array, until: float
+) -> tuple[tuple[Capsule, Capsule], tuple[Track, Track]]:
+    """Return upper arm and forearm of a person, at true size and speed, and their motions.
+
+    A recording, an instant in it, a point of the forearm and a rotation about the vertical axis are drawn at random.
+    At this instant, the point is at the meeting point.
+
+    Args:
+        rng: source of the random numbers.
+        time: when the forearm is at the meeting point [s].
+        meeting: the meeting point, shape (3,) [m].
+        until: when the motion may end [s].
+
+    Raises:
+        InputError: when the recordings are missing.
+    """
+    if not has_recordings():
+        raise InputError(
+            f"M10 needs the recordings of real persons: set {DATA} to the folder with mocap_arm and kinect_gestures, "
+            "or leave M10 out with --families"
+        )
+    recorded = _recordings(os.environ[DATA])
+    points = recorded[int(rng.integers(len(recorded)))].points
+    share = float(rng.uniform(0.3, 1.0))
+    meets = points[:, 1] + share * (points[:, 2] - points[:, 1])
+    speed = np.linalg.norm(np.gradient(meets, _STEP, axis=0), axis=1)
+    moving = np.flatnonzero(speed >= min(_LEAST_SPEED, 0.9 * float(speed.max())))
+    at = int(moving[rng.integers(len(moving))])
+    turn = quaternion_exp(np.array([0.0, 0.0, rng.uniform(-math.pi, math.pi)]))
+    placed = rotate(np.broadcast_to(turn, (len(points), 3, 4)), points - meets[at]) + meeting
+    times: Array = _STEP * (np.arange(len(points), dtype=float) - at) + time
+    keep = (times >= -BEFORE) & (times <= until)
+    parts = []
+    for name, first, radius in (("upper arm", 0, _UPPER), ("forearm", 1, _FORE)):
+        parts.append(_capsule(placed[keep, first], placed[keep, first + 1], radius, name, times[keep]))
+    (upper, upper_track), (fore, fore_track) = parts
+    return (upper, fore), (upper_track, fore_track)
+
+
+def _capsule(starts: Array, ends: Array, radius: float, name: str, times: Array) -> tuple[Capsule, Track]:
+    """Return a capsule of the mean length, and its motion: the middle, and the direction of the axis."""
+    axis = ends - starts
+    length = np.linalg.norm(axis, axis=1)
+    middle, unit = 0.5 * (starts + ends), axis / length[:, None]
+    half = 0.5 * float(length.mean()) * unit[0]
+    capsule = Capsule(middle[0] - half, middle[0] + half, radius, name=name)
+    return capsule, Track(times, middle, _rotations(unit))
+
+
+def _rotations(units: Array) -> Array:
+    """Return rotations that take z to each direction, each the smallest rotation from the one before, shape (n, 4)."""
+    found = [rotation_from_z(units[0])]
+    for before, now in pairwise(units):
+        across = np.cross(before, now)
+        sine = float(np.linalg.norm(across))
+        angle = math.atan2(sine, float(before @ now))
+        step = quaternion_exp(angle * across / sine) if sine > 1e-12 else np.array([1.0, 0.0, 0.0, 0.0])
+        turned = quaternion_multiply(step, found[-1])
+        found.append(turned / np.linalg.norm(turned))
+    return np.array(found)

@@ -1,0 +1,173 @@
+"""Saved results of a benchmark: one line of JSON for each experiment, one file for each method."""
+
+from __future__ import annotations
+
+import json
+import os
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from imitarm.benchmark.experiment import plain
+from imitarm.benchmark.provenance import code_version
+from imitarm.benchmark.running import Outcome, Store, Work
+from imitarm.errors import FileFormatError, InputError
+
+SUFFIX = ".jsonl"
+
+
+class LineStore(Store[Work, Outcome]):
+    """A folder with one file for each method, and one line in it for each experiment.
+
+    A line is written by one call to the operating system. A process that is killed can therefore leave at most one
+    incomplete line at the end of a file. Such a line is ignored when the file is read, and the next result begins a new
+    line. When an experiment has several lines, the last one counts.
+
+    A subclass says how a result is written and read. Results have the attributes ``experiment`` and ``code``, and
+    experiments have the attribute ``method``.
+
+    Args:
+        folder: the folder; created if missing.
+        reuse: whether a result of another version of the code is valid.
+
+    Raises:
+        InputError: when the folder can't be written to.
+    """
+
+    def __init__(self, folder: str | Path, *, reuse: bool = False) -> None:
+        self.folder, self.reuse = Path(folder), reuse
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(
+                f"{folder}: results can't be saved there ({error.strerror}); name another folder"
+            ) from error
+
+    @abstractmethod
+    def line(self, outcome: Outcome) -> str:
+        """Return a result as one line of JSON."""
+
+    @abstractmethod
+    def result(self, line: str) -> Outcome:
+        """Return the result in a line.
+
+        Raises:
+            ValueError: when the line is not a result of this version.
+        """
+
+    def known(self, experiments: Sequence[Work]) -> dict[Work, Outcome]:
+        """Return the saved results; results that are unreadable or (without ``reuse``) of other code are left out."""
+        wanted = set(experiments)
+        found: dict[Work, Outcome] = {}
+        for method in dict.fromkeys(_method(e) for e in experiments):
+            for result in results_in(self.path(method), self.result):
+                saved: Any = result
+                if saved.experiment in wanted and (self.reuse or saved.code == code_version()):
+                    found[saved.experiment] = result
+        return found
+
+    def save(self, experiment: Work, outcome: Outcome) -> Outcome:
+        """Append one line, and return the result as it is read from the line.
+
+        Raises:
+            OSError: when the line can't be written.
+        """
+        line = self.line(outcome)
+        data = line.encode() + b"\n"
+        with self.path(_method(experiment)).open("a+b", buffering=0) as file:
+            end = file.seek(0, os.SEEK_END)
+            if end:
+                file.seek(end - 1)
+                if file.read(1) != b"\n":  # a process was killed here
+                    data = b"\n" + data
+            if file.write(data) != len(data):
+                raise OSError(28, "the disk is full")
+        return self.result(line)
+
+    def path(self, method: str) -> Path:
+        """Return the file of a method."""
+        return self.folder / f"{method}{SUFFIX}"
+
+
+def json_line(result: Any, form: str) -> str:
+    """Return a result as one line of JSON; null stands for nan.
+
+    Args:
+        result: an object with experiment (a dataclass), code, outcome, reason and values.
+        form: name and version of the form.
+    """
+    content = {
+        "format": form,
+        "experiment": asdict(result.experiment),
+        "code": result.code,
+        "outcome": result.outcome,
+        "reason": result.reason,
+        "values": plain(dict(result.values)),
+    }
+    return json.dumps(content, allow_nan=False, separators=(",", ":"))
+
+
+def from_json(line: str, form: str, experiment: Callable[..., Work], result: Callable[..., Outcome]) -> Outcome:
+    """Return the result in a line of JSON.
+
+    Args:
+        line: what :func:`json_line` returned.
+        form: name and version of the form.
+        experiment: class of the experiment.
+        result: class of the result.
+
+    Raises:
+        ValueError: when the line is not JSON.
+        FileFormatError: when the line is not a result of this version.
+    """
+    content: dict[str, Any] = json.loads(line)
+    try:
+        if content["format"] != form:
+            raise FileFormatError(f"is not a result of this version ({form!r})")
+        facts = content["experiment"]
+        facts["options"] = tuple((name, value) for name, value in facts["options"])
+        return result(experiment(**facts), content["code"], content["outcome"], content["reason"], content["values"])
+    except (KeyError, TypeError, AttributeError) as error:
+        raise FileFormatError(f"is not a result ({type(error).__name__}: {error})") from error
+
+
+def _method(experiment: Any) -> str:
+    return str(experiment.method)
+
+
+def results_in(path: Path, result: Callable[[str], Outcome]) -> list[Outcome]:
+    """Return the results in a file; lines that can't be read are left out."""
+    if not path.exists():
+        return []
+    found = []
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        for line in lines:
+            try:
+                found.append(result(line))
+            except ValueError:  # an incomplete line, or a method that no longer exists
+                continue
+    return found
+
+
+def results_of_folders(folders: Iterable[str | Path], result: Callable[[str], Outcome], command: str) -> list[Outcome]:
+    """Return the results of all folders; when an experiment has several results, the last one counts.
+
+    Args:
+        folders: folders of results.
+        result: function that reads a line.
+        command: command that makes such a folder, for messages.
+
+    Raises:
+        InputError: when a folder does not exist or holds no results.
+    """
+    found: dict[Any, Outcome] = {}
+    for folder in map(Path, folders):
+        if not folder.is_dir():
+            raise InputError(f"{folder}: there is no such folder; '{command} --out {folder}' makes one")
+        here: list[Any] = [r for path in sorted(folder.glob(f"*{SUFFIX}")) for r in results_in(path, result)]
+        found.update({saved.experiment: saved for saved in here})
+        if not here:
+            raise InputError(f"{folder}: holds no results of '{command}'")
+    return list(found.values())

@@ -1,0 +1,164 @@
+"""``imitarm benchmark moving``: run and compare the avoidance methods among moving obstacles."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import time
+from pathlib import Path
+from typing import Any
+
+from imitarm.benchmark.moving import WORLDS, MovingExperiment, default_methods, run_experiment
+from imitarm.benchmark.moving_arm import ROBOTS
+from imitarm.benchmark.moving_results import MovingLines, MovingResults, read_folders
+from imitarm.benchmark.moving_scenes import FAMILIES
+from imitarm.benchmark.moving_tables import family_table, moving_tables, success_table
+from imitarm.benchmark.person_arm import DATA, has_recordings
+from imitarm.benchmark.provenance import code_version, origin
+from imitarm.benchmark.running import run_experiments
+from imitarm.benchmark.static_scenes import SPLITS
+from imitarm.cli.benchmark_options import add_fill, add_workers, place_of, report_tables, workers_of
+from imitarm.cli.outputs import check_outputs
+from imitarm.cli.screen import progress_bar, remark, say
+from imitarm.errors import InputError
+
+_FOLDER = Path("benchmark-moving")
+_RECORDED = "M10"
+
+
+def add_moving(parsers: Any) -> None:
+    """Add the parser of the command."""
+    moving = parsers.add_parser(
+        "moving", help="compare avoidance methods among moving obstacles (thesis Figs 5.7, 5.11)"
+    )
+    first, end = SPLITS["test"]
+    moving.add_argument(
+        "--families", nargs="+", choices=FAMILIES, metavar="NAME", help=f"default: {' '.join(FAMILIES)}"
+    )
+    moving.add_argument(
+        "--world",
+        nargs="+",
+        choices=WORLDS,
+        default=["tool"],
+        metavar="NAME",
+        help="tool: the tool alone (the default); "
+        + "; ".join(f"{robot}: the whole simulated arm with its {tool}" for robot, tool in ROBOTS.items()),
+    )
+    moving.add_argument("--dimensions", nargs="+", type=int, choices=(2, 3), default=[2, 3], help="default: 2 3")
+    moving.add_argument(
+        "--count", type=int, default=100, metavar="N", help="scenes of each family and dimension; default: 100"
+    )
+    moving.add_argument(
+        "--first", type=int, default=first, metavar="N", help=f"first seed; {first} to {end - 1} are for tests"
+    )
+    moving.add_argument(
+        "--methods", nargs="+", metavar="NAME", help=f"policies and controls; default: {' '.join(default_methods())}"
+    )
+    for name, default, unit, text in (
+        ("noise", 5.0, "MM", "standard deviation of the sensor"),
+        ("rate", 30.0, "HZ", "rate of the sensor"),
+        ("latency", 33.0, "MS", "delay of the sensor"),
+        ("dropout", 0.0, "PERCENT", "probability that an obstacle is missed in a frame"),
+        ("occlusions", 0.0, "HZ", "occlusions of 0.5 s per second"),
+    ):
+        moving.add_argument(
+            f"--{name}", nargs="+", type=float, default=[default], metavar=unit, help=f"{text}; default: {default:g}"
+        )
+    moving.add_argument("--out", type=Path, default=_FOLDER, metavar="DIR", help=f"of the results; default: {_FOLDER}")
+    moving.add_argument("--fresh", action="store_true", help="ignore saved results and run all experiments again")
+    moving.add_argument("--reuse", action="store_true", help="use saved results even if other code made them")
+    add_workers(moving)
+    moving.set_defaults(benchmark=_run)
+    actions = moving.add_subparsers(metavar="ACTION", title="actions; without one, the experiments are run")
+    comparison = actions.add_parser("compare", help="print the tables of saved results")
+    comparison.add_argument("folders", type=Path, nargs="+", metavar="FOLDER", help="folders of results")
+    comparison.add_argument("--report", type=Path, metavar="FILE", help="write a page with figures and playback (HTML)")
+    comparison.add_argument(
+        "--play", nargs="+", default=[], metavar="FAMILY,DIMENSION,SEED", help="scenes to draw, e.g. M3,3,2004"
+    )
+    add_fill(comparison)
+    comparison.set_defaults(benchmark=_compare)
+
+
+def experiments_of(arguments: argparse.Namespace) -> list[MovingExperiment]:
+    """Return the experiments that the options describe; those of one scene are neighbours.
+
+    Raises:
+        InputError: when an option is out of range, or the recordings for M10 are missing although M10 was named.
+    """
+    if arguments.count < 1 or arguments.first < 0:
+        raise InputError(f"--count must be at least 1 and --first at least 0: {arguments.count}, {arguments.first}")
+    families = list(arguments.families or FAMILIES)
+    if not arguments.families and not has_recordings():
+        families.remove(_RECORDED)
+        remark(f"{_RECORDED} is left out, because it needs real recordings; name their folder in {DATA}")
+    sensors = list(
+        itertools.product(
+            [1e-3 * n for n in arguments.noise],
+            arguments.rate,
+            [1e-3 * n for n in arguments.latency],
+            [0.01 * n for n in arguments.dropout],
+            arguments.occlusions,
+        )
+    )
+    seeds = range(arguments.first, arguments.first + arguments.count)
+    return [
+        MovingExperiment(family, dimension, seed, method, (), world, *sensor)
+        for seed in seeds
+        for family in families
+        for world in arguments.world
+        for dimension in (arguments.dimensions if world == "tool" else [3])
+        for sensor in sensors
+        for method in dict.fromkeys(arguments.methods or default_methods(world))
+    ]
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    """Run the experiments; print the rates of success."""
+    wanted, workers = experiments_of(arguments), workers_of(arguments)
+    store = MovingLines(arguments.out, reuse=arguments.reuse)
+    began, kept = time.perf_counter(), [0]
+
+    def on_done(done: int, of: int) -> None:
+        if not bar.tasks:
+            kept[0] = done
+            bar.add_task("moving", total=of)
+        bar.update(bar.tasks[0].id, completed=done)
+
+    with progress_bar() as bar:
+        done = run_experiments(wanted, run_experiment, store, workers, fresh=arguments.fresh, on_done=on_done)
+    seconds, ran = time.perf_counter() - began, len(done) - kept[0]
+    results = MovingResults(done)
+    for world in results.worlds:
+        own = results.in_world(world)
+        report_tables([success_table(own), family_table(own)], None, [code_version()])
+    say(f"{ran} experiments in {seconds:.0f} s; {kept[0]} were saved before")
+    say(f"compare the methods: imitarm benchmark moving compare {arguments.out}")
+    return 0
+
+
+def _compare(arguments: argparse.Namespace) -> int:
+    """Print the tables of saved results, and write files."""
+    place = place_of(arguments, "moving")
+    check_outputs([("--report", arguments.report)], [("--fill", arguments.fill)], new_folders=True)
+    found = read_folders(arguments.folders)
+    results, versions = MovingResults(found), [r.code for r in found]
+    if set(versions) != {code_version()}:
+        remark(origin(versions))
+    report_tables(moving_tables(results), place, versions)
+    if arguments.report is not None:
+        from imitarm.benchmark.moving_report import write_moving_report  # noqa: PLC0415 (draws: needs an extra)
+        from imitarm.cli.run_scene import provenance  # noqa: PLC0415
+
+        facts = provenance(results=origin(versions), experiments=len(found))
+        chosen = [_scene(text) for text in arguments.play]
+        say(f"wrote {write_moving_report(results, arguments.report, provenance=facts, scenes=chosen)}")
+    return 0
+
+
+def _scene(text: str) -> tuple[str, int, int]:
+    try:
+        family, dimension, seed = text.split(",")
+        return family, int(dimension), int(seed)
+    except ValueError as error:
+        raise InputError(f"--play {text}: write family, dimension and seed, such as M3,3,2004") from error
