@@ -6,7 +6,8 @@ import math
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import KDTree
 
 from imitarm.command import Command, Status
 from imitarm.errors import InputError
@@ -19,10 +20,11 @@ from imitarm.kinematics.pose import (
 )
 from imitarm.perception.margins import CoverageMargin
 from imitarm.policies.least_cost import STAY, Choice, LeastCost, Prediction, Response, allowed_axes, frame, headings
-from imitarm.policies.obstacle_cost import DistanceCost, GaussianCost, ObstacleCost, PredictedObstacles
+from imitarm.policies.obstacle_cost import DistanceCost, GaussianCost, Groups, ObstacleCost, PredictedObstacles
 from imitarm.policies.policy import Observation, Policy
 from imitarm.policies.primitive_path import PrimitivePath, learned_precision
 from imitarm.scene.distances import distances
+from imitarm.scene.scene import Scene
 from imitarm.skills.dmp import DMP
 from imitarm.skills.dynamical_systems import Gains
 from imitarm.skills.skill import Skill
@@ -328,6 +330,42 @@ class RCAMO(Policy):
             reason = f"the tool is {1e3 * deviation:.0f} mm from its path because of {self._reason}"
             return Command(twist, progress=self._phase, status=Status.AVOIDING, reason=reason)
         return Command(twist, progress=self._phase)
+
+    def cost_field(self, scene: Scene, points: ArrayLike) -> Array:
+        r"""Return the cost of the tool at points, for drawing: the cost of thesis Eq 5.1, corrected.
+
+        .. math:: J^G(\chi) = \tfrac12 w_e\,(\chi - \xi)^T \Theta\,(\chi - \xi) + \sum_i b_i(\chi)
+
+        The motion xi is represented by its point nearest to each chi, and the obstacles by their poses in the scene.
+
+        Args:
+            scene: goal and obstacles at one time.
+            points: positions of the tool's tip, shape (..., 3) [m]; the tool is not rotated against the learned start.
+
+        Returns:
+            Shape (...).
+        """
+        chi = finite_array(points, (..., 3), "RCAMO.cost_field: points", "m")
+        flat = chi.reshape(-1, 3)
+        path = PrimitivePath.of(self._dmp, self._precision, None, scene.goal)
+        nearest = KDTree(path.positions).query(flat)[1]
+        away = flat - path.positions[nearest]
+        pulled = np.matmul(path.precision[nearest], away[:, :, None])[..., 0]
+        cost = 0.5 * self.least_cost.deviation_weight * np.sum(away * pulled, axis=1)
+        turned = np.eye(3) if path.rotations is None else path.rotations[0]
+        packed = scene.packed
+        obstacles = PredictedObstacles(packed, np.zeros(1), np.zeros((len(packed), 1)))
+        still = np.zeros(len(flat)), np.zeros((1, 3))
+        for i in range(len(packed)):
+            values = []
+            for j, offset in enumerate(self._spheres @ turned.T):
+                groups = Groups(*(np.full(len(flat), index, dtype=np.intp) for index in (i, 0, j)))
+                gaps = self.least_cost.obstacle_cost.gaps(obstacles, groups, flat + offset, *still)
+                values.append(
+                    self.least_cost.obstacle_cost.values(obstacles, groups, flat + offset, *still, gaps)[:, 0]
+                )
+            cost += np.max(values, axis=0)
+        return np.asarray(cost.reshape(chi.shape[:-1]))
 
     def finished(self, observation: Observation) -> bool:
         """Return whether the phase is at its end, and the tool is nearer than ``arrival`` to the goal."""
