@@ -115,6 +115,7 @@ class RCAMO(Policy):
         limit = finite_number(max_acceleration, "RCAMO: max_acceleration", "m/s^2", above=0.0)
         spheres = np.zeros((1, 4)) if self.tool_spheres is None else self.tool_spheres
         self._spheres = spheres[:, :3]
+        self._offset_spheres = bool(self._spheres.any())
         self._tool_radius = float(np.max(np.linalg.norm(spheres[:, :3], axis=1) + spheres[:, 3]))
         forbidden = finite_array(np.reshape(np.asarray(self.forbidden, dtype=float), (-1, 3)), (None, 3), "forbidden")
         self._axes, rest = allowed_axes(forbidden / np.linalg.norm(forbidden, axis=1, keepdims=True))
@@ -225,8 +226,8 @@ class RCAMO(Policy):
 
     def _phases(self, rates: Array, times: Array) -> Array:
         """Return the phases at ``times`` (H,) [s] from now, when the phase takes up speeds (R, 1), shape (R, H)."""
-        transient = _RATE_TIME * (1.0 - np.exp(times / -_RATE_TIME))
-        return np.asarray(self._phase + (rates * times + (self._rate - rates) * transient) / self._dmp.duration_)
+        transient = (_RATE_TIME / self._dmp.duration_) * (1.0 - np.exp(times / -_RATE_TIME))
+        return np.asarray(self._phase + rates * (times / self._dmp.duration_) + (self._rate - rates) * transient)
 
     def _choose(self, path: PrimitivePath, lag: Array, near: _Near | None) -> Choice:
         if near is None:
@@ -235,18 +236,20 @@ class RCAMO(Policy):
         least_cost, times = self.least_cost, self.least_cost.times
         free = least_cost.response.free(self._deviation) + least_cost.response.A[:, None] * lag
 
-        goal = path.goal.position + self._offsets(path, path.nearest(np.ones((1, 1))))[0, 0]
+        goal = path.goal.position[None]
+        if self._offset_spheres:
+            goal = goal + self._offsets(path, np.full((1, 1), -1))[0, 0]
+        precision = path.precision[round(self._phase * (len(path.precision) - 1))]
 
         def predict(rates: Array) -> Prediction:
             phases = self._phases(rates[:, None], times)
-            samples = path.nearest(phases)
             centers = (path.positions_at(phases) + free)[:, :, None]
-            if self._spheres.any():
-                centers = centers + self._offsets(path, samples)
-            return Prediction(centers, free, path.precision[samples], phases >= 1.0, goal)
+            if self._offset_spheres:
+                centers = centers + self._offsets(path, path.nearest(phases))
+            return Prediction(centers, phases >= 1.0, goal)
 
         axes = frame(path.tangent(self._phase), self._axes)
-        chosen = least_cost.choose(axes, self._one_sided, self._scaled, predict, near.obstacles)
+        chosen = least_cost.choose(axes, self._one_sided, self._scaled, free, precision, predict, near.obstacles)
         self._scaled = chosen.scaled
         return chosen
 
