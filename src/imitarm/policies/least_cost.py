@@ -182,7 +182,7 @@ class LeastCost:
         + w_\Delta \|\hat u - \hat u_{prev}\|^2 + w_u \|\hat u\|^2 + w_r (1 - r)^2, \qquad \hat u = u / a_{max}
 
     This is thesis Eq 5.5, corrected: the task cost instead of the trajectory, an obstacle cost b that falls with the
-    distance, and a horizon over which both are summed. The precision Theta is that of the present phase. The candidates
+    distance, and a horizon over which both are summed. The precision Theta is that of the current phase. The candidates
     are u = 0, and three sizes of u in each heading. The speeds are those of ``rates``: to wait (r = 0) and to go back
     (r < 0) are candidates like the others.
 
@@ -299,7 +299,7 @@ class LeastCost:
             one_sided: directions in which u must have no component, shape (m, 3).
             previous: u / a_max of the last choice, shape (3,).
             free: deviations without coupling, shape (H, 3) [m].
-            precision: Theta at the present phase, shape (3, 3).
+            precision: Theta at the current phase, shape (3, 3).
             predict: returns the motion without coupling for speeds of the phase, shape (R,).
             obstacles: the obstacles that may come near.
         """
