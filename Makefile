@@ -87,6 +87,7 @@ $(VENV)/.report: $(BIN)/python pyproject.toml
 
 $(VENV)/.dev: $(BIN)/python pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	-$(BIN)/python -c 'from imitarm.perception import build_track_kernel; print(build_track_kernel())'
 	@touch $@
 
 $(VENV)/.bench: $(VENV)/.dev pyproject.toml

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 import arm_rows
 import ik_rows
+import rcamo_rows
 import retarget_rows
 import tracking_rows
 import transmission_rows
@@ -317,6 +318,7 @@ ROWS: tuple[Callable[[], Row], ...] = (
     avoidance_of_three,
     *arm_rows.ROWS,
     *ik_rows.ROWS,
+    *rcamo_rows.ROWS,
     *retarget_rows.ROWS,
     *tracking_rows.ROWS,
     *transmission_rows.ROWS,

@@ -1,4 +1,4 @@
-"""Draw what thesis Figs 4.2 to 4.8, 5.4 and 5.9 show, with this library, for the pages in docs/.
+"""Draw what thesis Figs 4.2 to 4.8, 5.2 to 5.4 and 5.9 show, with this library, for the pages in docs/.
 
     MUJOCO_GL=egl python scripts/draw_thesis_figures.py docs/images
 
@@ -44,6 +44,7 @@ from imitarm.tasks.habits import demonstrations_by, s_shaped_reach
 from imitarm.trajectory import Demonstration, Rollout
 from imitarm.viewer import palette
 from imitarm.viewer.maps import Grid, View, draw_components, draw_ellipses, draw_obstacles
+from rcamo_figures import figure_5_2, figure_5_3
 from take_picture import small_enough
 
 Array = NDArray[np.float64]
@@ -369,6 +370,8 @@ FIGURES = {
     "4.6": figure_4_6,
     "4.7": lambda: pictured("T1"),
     "4.8": lambda: pictured("T4"),
+    "5.2": figure_5_2,
+    "5.3": figure_5_3,
     "5.4": figure_5_4,
     "5.9": figure_5_9,
 }

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from imitarm.control_loop import CameraObserver
-from imitarm.errors import InputError
+from imitarm.errors import InputError, TaskFailedError
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.pose import Pose
+from imitarm.kinematics.pose import Pose, quaternion_exp
 from imitarm.perception import DepthNoise, Intrinsics, ObstacleDetector, ObstacleTracker
 from imitarm.robots import SimulatedRobot
 from imitarm.robots.depth_camera import DepthCamera
-from imitarm.scene import Scene, Sphere
+from imitarm.scene import Box, Scene, Sphere, standard_fixtures
 from seen_scenes import looking
 
 CAMERA = Intrinsics.from_field_of_view(160, 120, 1.0)
@@ -128,6 +128,28 @@ def test_a_frozen_camera_keeps_the_old_stamp(arm):
     assert observe.stamp == pytest.approx(0.8)
     assert len(observe(3.0).obstacles) == 1  # what was seen last is still there
     assert observe.n_frames == 21
+
+
+@pytest.mark.parametrize(
+    "change",
+    [Pose([0, 0, 0.06], [1, 0, 0, 0]), Pose([0, 0, -0.3], [1, 0, 0, 0]), Pose([0, 0, 0], quaternion_exp([0, 0.1, 0]))],
+    ids=["6 cm up", "30 cm down", "6 degrees"],
+)
+def test_a_camera_that_was_moved_stops_the_loop(arm, change):
+    table = Box(Pose([0.8, 0.0, -0.2], [1.0, 0.0, 0.0, 0.0]), [0.8, 1.4, 0.1], name="table")
+    robot = SimulatedRobot(
+        arm, scene=Scene(None, [Sphere([0.7, -0.5, 0.1], 0.1)], fixtures=[*standard_fixtures(), table])
+    )
+    exact = DepthCamera(robot, CAMERA, EYE, **KINECT)
+    wrong = {"pose": EYE}
+    observe = observer_of(robot, lambda: replace(exact.frame(), camera_to_base=wrong["pose"]), rate=10.0)
+    with pytest.raises(TaskFailedError, match=r"camera 1: .*was moved"):
+        for k in range(60):
+            if k == 25:
+                wrong["pose"] = Pose(EYE.position + change.position, (change @ EYE).quaternion)
+            observe(0.1 * k)
+            robot.move(np.zeros(7), 0.1)
+    assert k > 30  # not in one image only
 
 
 def test_two_cameras_are_used_and_one_may_have_no_image(arm):

@@ -13,7 +13,7 @@ from draw_thesis_figures import FIGURES, main
 from imitarm.errors import InputError
 
 DOCS = Path(__file__).parents[1] / "docs"
-QUICK = ["4.2", "4.3", "4.4", "4.5", "5.9"]  # without a simulation
+QUICK = ["4.2", "4.3", "4.4", "4.5", "5.2", "5.3", "5.9"]  # without a simulation
 
 
 def test_the_quick_figures_are_drawn(tmp_path):

@@ -127,13 +127,12 @@ def test_the_choice_equals_that_of_all_candidates_computed_one_by_one(seed, kind
     deviation, previous = rng.uniform(-0.02, 0.02, (2, 3)), 0.3 * rng.uniform(-1, 1, 3)
     free, start = chooser.response.free(deviation), rng.uniform(-0.15, 0.05, 3)
     root = rng.normal(size=(3, 3))
-    precision = np.broadcast_to(root @ root.T / 3.0 + 0.3 * np.eye(3), (len(TIMES), 3, 3))
+    precision = root @ root.T / 3.0 + 0.3 * np.eye(3)
 
     def predict(rates):
         xi = start + 0.2 * rates[:, None, None] * TIMES[:, None] * np.array([0.6, 0.8, 0.0])
         arrived = np.zeros((len(rates), len(TIMES)), dtype=bool)
-        full = np.broadcast_to(precision, (len(rates), *precision.shape))
-        return Prediction((xi + free)[:, :, None] + offsets, free, full, arrived, offsets)
+        return Prediction((xi + free)[:, :, None] + offsets, arrived, offsets)
 
     units = headings(np.eye(3)) @ axes.T
     pushes = [np.zeros(3), *[size * unit for size in chooser.sizes for unit in units]]
@@ -144,7 +143,7 @@ def test_the_choice_equals_that_of_all_candidates_computed_one_by_one(seed, kind
             e = free + 20.0 * chooser.response.G[:, None] * push
             total = 0.02 * np.sum((push - previous) ** 2) + 0.02 * push @ push + 2.0 * (1.0 - rate) ** 2
             for m in range(len(TIMES)):
-                total += 0.93 ** (m + 1) * 8.0 * e[m] @ precision[m] @ e[m]
+                total += 0.93 ** (m + 1) * 8.0 * e[m] @ precision @ e[m]
                 for i in range(3):
                     groups = Groups(np.full(2, i), np.full(2, m), np.arange(2))
                     still = moved[m] + e[m] - free[m], np.zeros(2), np.zeros((1, 3))
@@ -152,7 +151,7 @@ def test_the_choice_equals_that_of_all_candidates_computed_one_by_one(seed, kind
                     total += 0.93 ** (m + 1) * values.max()
             if total < best[0]:
                 best = (total, push, rate)
-    found = chooser.choose(axes, np.empty((0, 3)), previous, predict, obstacles)
+    found = chooser.choose(axes, np.empty((0, 3)), previous, free, precision, predict, obstacles)
     assert found.cost == pytest.approx(best[0], rel=1e-4, abs=1e-4)
     assert found.rate == best[2]
     np.testing.assert_allclose(found.scaled, best[1], atol=1e-12)

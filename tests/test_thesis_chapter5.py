@@ -9,7 +9,12 @@ import pytest
 
 from imitarm.kinematics.pose import Pose
 from imitarm.perception import Detection, ObstacleTracker
-from imitarm.scene import Sphere
+from imitarm.policies import RCAMO, DistanceCost, GaussianCost
+from imitarm.policies.obstacle_cost import Groups, PredictedObstacles
+from imitarm.policies.primitive_path import learned_precision
+from imitarm.scene import Scene, Sphere
+from imitarm.skills import Skill
+from imitarm.trajectory import Demonstration, Trajectory
 
 
 class TestTracking:
@@ -79,3 +84,50 @@ class TestTracking:
             found = [Detection(Sphere(p, 0.02), self.NOISE, camera_to_base=camera) for p in positions]
             assert len(tracker.update(k / 30.0, found)) == (10 if k else 0)
         assert time.process_time() - began < 1.0  # one second of frames, on any machine
+
+
+def test_equation_5_1_as_printed_grows_with_the_distance():
+    """Section 5.1.2: the exponent lacks its minus sign, and a width is subtracted from a cost."""
+    distance = np.linspace(0.0, 0.5, 20)
+    printed = 1.0 * np.exp(distance**2 * 40.0) - 0.05
+    assert (np.diff(printed) > 0.0).all() and printed.argmin() == 0
+    ball = PredictedObstacles(Scene(obstacles=[Sphere([0, 0, 0], 0.05)]).packed, np.zeros(1), np.zeros((1, 1)))
+    groups = Groups(*[np.zeros(20, dtype=np.intp)] * 3)
+    still = np.outer(distance, [1.0, 0.0, 0.0]), np.zeros(20), np.zeros((1, 3))
+    for cost in (DistanceCost(0.02, np.zeros(1)), GaussianCost(0.02, np.zeros(1))):
+        values = cost.values(ball, groups, *still, cost.gaps(ball, groups, *still))
+        assert (np.diff(values[:, 0]) <= 0.0).all() and values[0, 0] > values[-1, 0]
+
+
+def reach():
+    """Demonstrations that agree in the first half of the motion, and differ by centimetres in the second."""
+    t = np.linspace(0.0, 2.0, 100)
+    rise = np.clip(t - 1.0, 0.0, 1.0)
+    return Skill(5).fit(
+        [
+            Demonstration(Trajectory(t, np.column_stack([0.3 + 0.2 * t, side * rise, 0.3 + 0.05 * np.sin(3.0 * t)])))
+            for side in (-0.06, -0.02, 0.03, 0.07)
+        ]
+    )
+
+
+def test_theta_of_equation_5_1_is_large_where_the_demonstrations_agree():
+    precision = learned_precision(reach())
+    assert precision[100, 1, 1] > 4.0 * precision[550, 1, 1]
+    sizes = np.linalg.eigvalsh(precision)
+    assert sizes.min() >= 0.25 - 1e-9 and sizes.max() <= 4.0 + 1e-9
+
+
+def test_the_cost_of_figure_5_3_is_lowest_on_the_path_and_highest_at_the_obstacle():
+    skill = reach()
+    path = skill.generate().positions
+    policy = RCAMO(skill, tool_spheres=[[0.0, 0.0, 0.0, 0.02]])
+    beside = path + [0.0, 0.0, 0.05]
+    assert policy.cost_field(Scene(), path).max() < 1e-4
+    assert policy.cost_field(Scene(), beside).min() > policy.cost_field(Scene(), path).max()
+    ball = Sphere(path[len(path) // 2], 0.04)
+    cost = policy.cost_field(Scene(obstacles=[ball]), path)
+    inside = ball.signed_distance(path) < 0.0
+    assert cost[inside].min() > cost[~inside].max() and cost[[0, -1]].max() < 1e-3
+    grid = np.zeros((4, 5, 3))
+    assert policy.cost_field(Scene(), grid).shape == (4, 5)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from imitarm.control_loop.observer import Tracker
-from imitarm.errors import InputError
+from imitarm.errors import InputError, TaskFailedError
 from imitarm.kinematics.pose import Pose
 from imitarm.perception import DepthFrame, ObstacleDetector, PointCloud
 from imitarm.scene import Obstacle, Scene
@@ -23,10 +23,11 @@ _ROUNDING = 1e-9  # [s]
 
 
 class _Waiting(NamedTuple):
-    """An image on its way: when it arrives [s], and what it is."""
+    """An image on its way: when it arrives [s], and which camera took it."""
 
     arrival: float
     frame: Frame
+    camera: int
 
 
 class CameraObserver:
@@ -41,6 +42,10 @@ class CameraObserver:
     **A frozen camera.** An image whose stamp is not newer than the one before is ignored. If the newest image is older
     than ``max_age``, the scene is no longer predicted: its ``stamp`` stays that of the newest image, so that a watchdog
     can see how old it is. Before the first image, the scene is empty and its stamp is that of the first call.
+
+    **A camera that was moved.** Once per second, the known surfaces in the image are compared with their true places
+    (:meth:`~imitarm.perception.ObstacleDetector.camera_error`). If they do not fit in two such images of one camera in
+    succession, the call raises an error, and the control loop brakes the robot.
 
     Calls must be in the order of time, as a camera can't take images of the past.
 
@@ -105,6 +110,8 @@ class CameraObserver:
         self.n_frames = 0
         self._waiting: deque[_Waiting] = deque()
         self._taken = [-math.inf] * len(self._cameras)  # stamp of the newest image of each camera
+        self._checked = [-math.inf] * len(self._cameras)
+        self._doubted = [False] * len(self._cameras)
         self._next, self._now = -math.inf, -math.inf
         self._stamp: float | None = None
 
@@ -118,6 +125,7 @@ class CameraObserver:
 
         Raises:
             InputError: when ``time`` is not a finite number, or is earlier than in the last call.
+            TaskFailedError: when a camera was moved.
         """
         time = finite_number(time, "CameraObserver: time", "s")
         if time < self._now:
@@ -131,7 +139,7 @@ class CameraObserver:
         if time >= self._next - _ROUNDING:
             self._take(time)
         while self._waiting and self._waiting[0].arrival <= time + _ROUNDING:
-            self._use(self._waiting.popleft().frame)
+            self._use(self._waiting.popleft())
         fresh = self._stamp is None or time - self._stamp <= self.max_age
         at = time if fresh or self._stamp is None else self._stamp
         return self.tracker.scene(at, goal=self._goal, fixtures=self._fixtures)
@@ -145,11 +153,23 @@ class CameraObserver:
             frame = camera()
             if frame is not None and frame.stamp > self._taken[i]:
                 self._taken[i] = frame.stamp
-                self._waiting.append(_Waiting(time + self.latency, frame))
+                self._waiting.append(_Waiting(time + self.latency, frame, i))
 
-    def _use(self, frame: Frame) -> None:
+    def _use(self, waiting: _Waiting) -> None:
         """Find the obstacles in an image that has arrived, and give them to the tracker."""
+        frame, camera = waiting.frame, waiting.camera
+        self._check(frame, camera)
         stamp = frame.stamp - self.clock
         self.tracker.update(stamp, self.detector.detect(frame))
         self._stamp = stamp if self._stamp is None else max(stamp, self._stamp)
         self.n_frames += 1
+
+    def _check(self, frame: Frame, camera: int) -> None:
+        """Check once per second that the camera is at its place."""
+        if frame.stamp < self._checked[camera] + 1.0:
+            return
+        self._checked[camera] = frame.stamp
+        error = self.detector.camera_error(frame)
+        if error and self._doubted[camera]:
+            raise TaskFailedError(f"camera {camera + 1}: {error}")
+        self._doubted[camera] = bool(error)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -135,3 +136,10 @@ def duplicates(measured: Measurements, gate: float) -> list[tuple[int, int]]:
     difference = positions[first] - positions[second]
     inside = np.einsum("ki,kij,kj->k", difference, inverse, difference) <= gate
     return list(zip(first[inside].tolist(), second[inside].tolist(), strict=True))
+
+
+def matching_labels(labels: Sequence[str], others: Sequence[str]) -> NDArray[np.bool_] | None:
+    """Return which labels may belong to the same obstacle, shape (n, m); None: all."""
+    if not any(labels) or not any(others):
+        return None
+    return np.array([[not a or not b or a == b for b in others] for a in labels])

@@ -52,6 +52,26 @@ class FreeSpace:
             empty |= surface.distances_at(points, False)[0] < -margin
         if self._frame is None:
             return empty
+        measured, depth = self._seen(points)
+        with np.errstate(invalid="ignore"):
+            return empty | (measured > depth + margin + 3.0 * self._sigma(depth))
+
+    def hidden(self, points: Array, margin: float = 0.01) -> Mask:
+        """Return which points (..., 3) are behind something that the camera saw, or outside of the image, shape (...).
+
+        Args:
+            points: points in the base frame [m].
+            margin: distance by which the ray must end before the point, in addition to three standard deviations [m].
+        """
+        if self._frame is None:
+            return np.zeros(points.shape[:-1], dtype=bool)
+        measured, depth = self._seen(points)
+        with np.errstate(invalid="ignore"):
+            return np.isneginf(measured) | (measured < depth - margin - 3.0 * self._sigma(depth))
+
+    def _seen(self, points: Array) -> tuple[Array, Array]:
+        """Return the measured depths of the pixels of points [m], -inf outside of the image, and the points' depths."""
+        assert self._frame is not None
         camera = self._frame.intrinsics
         x, y, z = np.moveaxis(self._base_to_camera.apply(points), -1, 0)
         ahead = z > 1e-3
@@ -60,9 +80,7 @@ class FreeSpace:
         row = np.rint(camera.fy * y / z + camera.cy)
         inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         pixel = np.where(inside, row, 0).astype(np.intp), np.where(inside, column, 0).astype(np.intp)
-        with np.errstate(invalid="ignore"):
-            behind = self._depth[pixel] > z + margin + 3.0 * self._sigma(z)
-        return empty | (inside & behind)
+        return np.where(inside, self._depth[pixel], -np.inf), z
 
     def below(self, points: Array, reach: float) -> Array:
         """Return the nearest points on the known surfaces of those ``points`` (n, 3) that are within ``reach`` [m]."""

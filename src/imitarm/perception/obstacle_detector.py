@@ -24,16 +24,21 @@ from imitarm.perception.self_filter import SelfFilter
 from imitarm.perception.shape_choice import SHAPES, fit_shape
 from imitarm.perception.shape_fit import Visible
 from imitarm.perception.target import Target
-from imitarm.scene import Obstacle, Scene
+from imitarm.scene import Box, HalfSpace, Obstacle, Scene
 from imitarm.validation import choice, finite_array, finite_number, flag, instance, sequence, whole_number
 
 Array = NDArray[np.float64]
 Frame = DepthFrame | PointCloud
 
 _SLANTED = 2.5  # neighbouring points of a slanted surface are farther apart than the rays by up to this factor
-_CLEARLY_CONCAVE = 0.006  # [m] above the noise
+_CLEARLY_CONCAVE = 0.003  # [m] above the noise
 _MOST_PARTS = 4  # of one cluster
 _MOST_VOXELS = 300  # of one object; more don't improve the fit
+_ENOUGH = 200  # points from which the pose of the camera is checked
+_CHECKED = 1500  # points with which it is checked
+_SEARCHED = 0.25  # [m] around its place in which a surface is searched for
+_MOVED, _TILTED = 0.03, 0.07  # [m], [rad] by which a surface may appear at a wrong place
+_INSIDE = 0.1  # largest fraction of rays through known surfaces
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -182,6 +187,59 @@ class ObstacleDetector:
             self.record(frame.stamp, q)
         return self._obstacle_points(frame)[0].points
 
+    def camera_error(self, frame: Frame) -> str:
+        """Return a message if the camera is not where the frame says; empty if nothing indicates this.
+
+        After somebody has moved a camera, the known surfaces appear at wrong places. Two signs are checked: many rays
+        go through known surfaces, or the plane of a half-space or of the upper face of a box is more than 3 cm or 4
+        degrees away from its place, and hardly any points are at its place.
+
+        Args:
+            frame: depth image or point cloud.
+        """
+        measured = _measured(frame, self.depth_range)
+        if len(measured.points) < _ENOUGH:
+            return ""
+        chosen = np.linspace(0, len(measured.points) - 1, min(len(measured.points), _CHECKED)).astype(int)
+        points, margin = measured.points[chosen], _MOVED + self.noise.sigma(measured.depth[chosen])
+        rays = points - measured.origin
+        rays /= np.linalg.norm(rays, axis=1)[:, None]
+        samples = points[:, None] - np.arange(0.0, 0.6, 0.04)[:, None] * rays[:, None]
+        inside = np.zeros(len(points), dtype=bool)
+        for surface in self.surfaces:
+            inside |= (surface.distances_at(samples, False)[0] < -margin[:, None]).any(axis=1)
+            message = self._misplaced(surface, points)
+            if message:
+                return message
+        if inside.mean() > _INSIDE:
+            return (
+                f"{100.0 * inside.mean():.0f} % of the rays go through known surfaces; the camera was moved: calibrate "
+                "it again"
+            )
+        return ""
+
+    def _misplaced(self, surface: Obstacle, points: Array) -> str:
+        """Return a message if a horizontal surface is seen beside its place."""
+        normal = _upper_normal(surface)
+        if normal is None:
+            return ""
+        height = surface.distances_at(points, False)[0]
+        near = points[np.abs(height) < _SEARCHED]
+        if len(near) < 0.1 * _ENOUGH or (np.abs(height) < _MOVED).sum() > 0.25 * len(near):
+            return ""
+        found = segmentation.fit_plane(near, normal=normal, least_fraction=0.3)
+        if found is None:
+            return ""
+        middle = near[np.abs(found.distances_at(near, False)[0]) < 0.02].mean(axis=0)
+        off = abs(float(surface.signed_distance(middle)))
+        tilt = float(np.arccos(np.clip(found.normal @ normal, -1.0, 1.0)))
+        if off <= _MOVED and tilt <= _TILTED:
+            return ""
+        return (
+            f"the surface {surface.name or surface.kind!r} is seen {1e3 * off:.0f} mm and {np.degrees(tilt):.0f} deg "
+            "away from its place; the camera was moved: calibrate it again"
+        )
+
     def _obstacle_points(self, frame: Frame) -> tuple[_Measured, tuple[Obstacle, ...]]:
         measured = _measured(frame, self.depth_range)
         low, high = self.workspace
@@ -284,6 +342,14 @@ class ObstacleDetector:
         found = fit_shape(visible, space, self.shapes, part.points)
         label = self._label(found.obstacle, part.colors)
         return replace(found, label=label, camera_to_base=part.camera)
+
+
+def _upper_normal(surface: Obstacle) -> Array | None:
+    """Return the normal of a half-space or of the upper face of an upright box; None for other surfaces."""
+    if isinstance(surface, HalfSpace):
+        return surface.normal
+    upright = isinstance(surface, Box) and abs(surface.pose.rotation[2, 2]) > 0.999
+    return _UP if upright else None
 
 
 def _take(measured: _Measured, group: NDArray[np.intp]) -> _Measured:

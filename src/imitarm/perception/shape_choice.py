@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 SHAPES = ("sphere", "cylinder", "capsule", "box", "convex_hull")
 _PARAMETERS = {"sphere": 4, "cylinder": 7, "capsule": 7, "box": 9}
 _DIRECTIONS = 64  # surface points of a shape that are compared with the free space
+_UNLIKE = 0.05  # standard deviation of the position of an object that is not exactly of the fitted shape, in its size
 _WITHIN = 0.8  # where these points are, from the middle of the shape to its surface: a corner may be seen to be empty
 _FLOATING = 0.25  # largest fraction of a shape's surface in the free space
 _RELATED = 4.0  # neighbouring points have similar errors: so many points count as one
@@ -47,9 +48,10 @@ def fit_shape(
     the size of the visible part or 0.3 m. At last, the shape grows until it contains every visible point, up to twice
     the standard deviation of the noise.
 
-    The covariance of the position contains the noise of the points, the distance between neighbouring rays, and the
-    uncertain size of the unseen part: a length that may be anything from 0 to ``g`` moves the centre with a standard
-    deviation of ``g / sqrt(48)``.
+    The covariance of the position contains the noise of the points, the distance between neighbouring rays, a twentieth
+    of the size because no object has exactly the fitted shape, and the uncertain size of the unseen part: a side that
+    was extended by ``g`` may end anywhere before, which moves the true centre by up to ``g / 2``, and by ``g /
+    sqrt(12)`` in the root mean square.
 
     Args:
         visible: points to which the shapes are fitted.
@@ -79,12 +81,14 @@ def fit_shape(
     _, spread, best = next(standing, (np.inf, np.inf, None))
     if best is None or ("convex_hull" in shapes and spread > 2.0 * floor + 0.004):
         removed = 0.01 + 1.5 * visible.sigma + visible.spacing  # [m] above a surface, where points are lost
-        best = shape_fit.hull(visible, space.below(visible.points, removed))
-        spread = visible.spacing
+        unseen = [space.below(visible.points, removed), _behind_others(visible, space)]
+        best = shape_fit.hull(visible, np.concatenate(unseen))
+        spread = 1.0 / np.sqrt(_RELATED)  # its covariance is complete
     variance = max(spread, visible.sigma) ** 2 * _RELATED
     obstacle, grown = grow(_wider(best, best.radius * float(np.sqrt(variance))), visible, space)
     noise = variance * best.covariance
-    covariance = noise + (visible.spacing**2 / 12.0 + 1e-6) * np.eye(3) + grown
+    extent = float(np.mean(np.ptp(visible.points, axis=0)))
+    covariance = noise + (visible.spacing**2 / 12.0 + (_UNLIKE * extent) ** 2 + 1e-6) * np.eye(3) + grown
     return Detection(contain(obstacle, every, 2.0 * visible.sigma), 0.5 * (covariance + covariance.T))
 
 
@@ -115,6 +119,27 @@ def box_axes(visible: Visible) -> list[Array]:
     chosen = normals[common]
     direction = np.linalg.eigh(chosen.T @ chosen)[1][:, 2]
     return _distinct([direction, np.array([0.0, 0.0, 1.0])])
+
+
+def _behind_others(visible: Visible, space: FreeSpace) -> Array:
+    """Return points to which an object may extend behind others that hide a part of it, shape (k, 3).
+
+    From the outline, the object may go on sideways as long as the camera's view is blocked by something nearer, at most
+    by half of its visible width.
+    """
+    points = visible.points
+    sight = points.mean(axis=0) - visible.origin
+    first, second = np.concatenate(shape_fit.basis_across((sight / np.linalg.norm(sight))[None]))
+    angles = np.arange(16) * (np.pi / 8.0)
+    directions = np.cos(angles)[:, None] * first + np.sin(angles)[:, None] * second
+    along = points @ directions.T
+    rim = points[along.argmax(axis=0)]
+    lengths = _steps(max(0.5 * float(np.ptp(along, axis=0).max()), visible.spacing), visible)
+    samples = rim[:, None] + (visible.spacing + lengths)[:, None] * directions[:, None]
+    hidden = np.logical_and.accumulate(space.hidden(samples), axis=1)
+    far = hidden.sum(axis=1)
+    found = far > 0
+    return np.asarray(samples[found, far[found] - 1])
 
 
 def _wider(fit: Fit, by: float) -> Obstacle:
@@ -183,7 +208,7 @@ def _grow_box(box: Box, visible: Visible, space: FreeSpace) -> tuple[Obstacle, A
                 high[j] += grown
             else:
                 low[j] -= grown
-            variance[j] += grown**2 / 48.0
+            variance[j] += grown**2 / 12.0
     pose = Pose(box.pose.position + rotation @ (0.5 * (low + high)), box.pose.quaternion)
     return Box(pose, high - low), rotation @ np.diag(variance) @ rotation.T
 
@@ -204,7 +229,7 @@ def _grow_bar(bar: Cylinder | Capsule, visible: Visible, space: FreeSpace) -> tu
             along = (half + cap + lengths)[:, None, None] * sign * axis
             grown = _until_empty(solid.position + along + disc, lengths, space, visible)
         ends.append(solid.position + sign * (half + grown) * axis)
-        variance += grown**2 / 48.0
+        variance += grown**2 / 12.0
     covariance = variance * np.outer(axis, axis)
     if isinstance(bar, Capsule):
         return replace(bar, start=ends[0], end=ends[1]), covariance

@@ -19,6 +19,7 @@ _SMALL_STEP = 2e-4  # [m] after which a fit has converged
 _LARGEST = 2.0  # [m] of a fitted radius
 _FLATTEST = 2.0  # largest radius, in half widths of the visible points: with a larger one, they are as good as flat
 _BEYOND = 0.75  # [spacings] from the outermost pixel of an object to its outline, which may be lost
+_SIDEWAYS, _ALONG = 0.1, 0.25  # standard deviations of a hull's position, in its size, across and along the sight
 _NEIGHBOURS = 12  # points from which a normal is estimated
 _YAWS = np.radians(np.arange(0.0, 90.0, 5.0))
 _FINE = np.radians(np.arange(-4.0, 5.0, 1.0))
@@ -53,7 +54,8 @@ class Fit(NamedTuple):
 
     Attributes:
         obstacle: the shape.
-        covariance: covariance of its position for residuals of one metre: the block of ``(J^T J)^-1``, shape (3, 3).
+        covariance: covariance of its position for residuals of one metre: the block of ``(J^T J)^-1``, shape (3, 3);
+            for a hull, the covariance itself [m^2].
         radius: standard deviation of its radius for residuals of one metre; 0 for shapes without a radius.
         outline: half of the width in which the object is seen [m]; 0 for shapes without a radius.
     """
@@ -147,7 +149,7 @@ def capsules(visible: Visible, axes: Array) -> list[Fit]:
     for _ in range(_ROUNDS):
         middle = 0.5 * (low + high)
         low, high = np.minimum(low, middle), np.maximum(high, middle)
-        e1, e2 = _across(axes)
+        e1, e2 = basis_across(axes)
         p = visible.points - centers[:, None]
         along = np.einsum("bnk,bk->bn", p, axes)
         nearest = np.clip(along, low[:, None], high[:, None])
@@ -181,7 +183,7 @@ def box(visible: Visible, axis: Array) -> Fit:
     (*L-shape fitting*: Zhang, Xu, Dong and Dolan, IV 2017). A visible face is the mean of its points; the other faces
     are at the outermost points.
     """
-    e1, e2 = np.concatenate(_across(axis[None]))
+    e1, e2 = np.concatenate(basis_across(axis[None]))
     local = np.column_stack([visible.points @ e1, visible.points @ e2, visible.points @ axis])
     eye = np.array([visible.origin @ e1, visible.origin @ e2, visible.origin @ axis])
     yaw = _best_yaw(local, eye, _YAWS)
@@ -205,7 +207,7 @@ def box(visible: Visible, axis: Array) -> Fit:
     return Fit(Box(pose, size), rotation @ np.diag(0.25 * variance.sum(axis=1)) @ rotation.T)
 
 
-def hull(visible: Visible, lowest: Array | None = None) -> Fit:
+def hull(visible: Visible, unseen: Array | None = None) -> Fit:
     """Enclose the points and a mirrored copy of them behind the object, as its unseen back.
 
     The back of a convex object begins where its outline is seen. The points are mirrored in the plane perpendicular to
@@ -214,7 +216,7 @@ def hull(visible: Visible, lowest: Array | None = None) -> Fit:
 
     Args:
         visible: the points.
-        lowest: more points that the hull contains, for example on the table below the object, shape (m, 3) [m].
+        unseen: more points that the hull contains, for example on the table below the object, shape (m, 3) [m].
     """
     points = visible.points
     sight = points.mean(axis=0) - visible.origin
@@ -226,8 +228,9 @@ def hull(visible: Visible, lowest: Array | None = None) -> Fit:
     plane = max(far + _BEYOND * visible.spacing, near + 0.5 * (narrow + visible.spacing), near + THINNEST)
     back = points + (2.0 * (plane - depth))[:, None] * sight
     spread = _BEYOND * visible.spacing * _rim(across)
-    covariance = np.eye(3) / len(points) + np.outer(sight, sight)
-    more = np.zeros((0, 3)) if lowest is None else lowest
+    size = 0.5 * (narrow + 2.0 * (plane - near))
+    covariance = (_SIDEWAYS * size) ** 2 * np.eye(3) + (_ALONG * size) ** 2 * np.outer(sight, sight)
+    more = np.zeros((0, 3)) if unseen is None else unseen
     return Fit(centered_hull(np.concatenate([points + spread, back + spread, more])), covariance)
 
 
@@ -267,7 +270,7 @@ def _round_bars(visible: Visible, axes: Array, chosen: NDArray[np.bool_], rounds
     weights = np.where(chosen.sum(axis=1, keepdims=True) >= 8, chosen, True).astype(float)
     k, n = weights.shape
     centers = np.repeat(visible.points.mean(axis=0)[None], k, axis=0)
-    e1, e2 = _across(axes)
+    e1, e2 = basis_across(axes)
     p = visible.points - centers[:, None]
     x, y = np.einsum("bnk,bk->bn", p, e1), np.einsum("bnk,bk->bn", p, e2)
     system = np.stack([2.0 * x, 2.0 * y, np.ones((k, n))], axis=-1)
@@ -279,7 +282,7 @@ def _round_bars(visible: Visible, axes: Array, chosen: NDArray[np.bool_], rounds
     centers = centers + shift[:, :1] * e1 + shift[:, 1:] * e2
     normal = np.tile(np.eye(5), (k, 1, 1))
     for _ in range(rounds):
-        e1, e2 = _across(axes)
+        e1, e2 = basis_across(axes)
         p = visible.points - centers[:, None]
         along = np.einsum("bnk,bk->bn", p, axes)
         away = p - along[..., None] * axes[:, None]
@@ -309,7 +312,7 @@ def _outline(visible: Visible, center: Array, axis: Array | None) -> float:
     width of a bar is measured across its axis.
     """
     sight = center - visible.origin
-    first, second = np.concatenate(_across((sight / np.linalg.norm(sight))[None]))
+    first, second = np.concatenate(basis_across((sight / np.linalg.norm(sight))[None]))
     if axis is None:
         directions = np.stack([first, second])
     else:
@@ -331,7 +334,7 @@ def _bar_covariance(inverse: Array, axis: Array, middle: float) -> Array:
     """Return the covariance of the middle of a bar for residuals of one metre, shape (3, 3)."""
     to_middle = np.array([[1.0, 0.0, middle, 0.0, 0.0], [0.0, 1.0, 0.0, middle, 0.0]])
     across = to_middle @ inverse @ to_middle.T
-    basis = np.concatenate(_across(axis[None]))
+    basis = np.concatenate(basis_across(axis[None]))
     return np.asarray(basis.T @ across @ basis + np.outer(axis, axis))
 
 
@@ -351,7 +354,7 @@ def _best_yaw(local: Array, eye: Array, yaws: Array) -> float:
     return float(yaws[int(cost.argmin())])
 
 
-def _across(axes: Array) -> tuple[Array, Array]:
+def basis_across(axes: Array) -> tuple[Array, Array]:
     """Return two unit vectors (k, 3) that are perpendicular to each of ``axes`` (k, 3) and to each other.
 
     The formula is from Duff et al., *Building an orthonormal basis, revisited*, JCGT 2017.

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import Pose
-from imitarm.perception.association import NO_PAIRS, Pairs, assign, duplicates
+from imitarm.perception.association import NO_PAIRS, Pairs, assign, duplicates, matching_labels
 from imitarm.perception.consistency import Consistency, chi_square_quantile
 from imitarm.perception.detection import Detection
-from imitarm.perception.motion_filter import Measurements, MotionFilter
-from imitarm.perception.tracks import UNCONFIRMED, TrackedObstacle, Tracks
+from imitarm.perception.motion_filter import Belief, Measurements, MotionFilter
+from imitarm.perception.track_kernel import updated
+from imitarm.perception.tracks import UNCONFIRMED, TrackedObstacle, Tracks, smoothed_sizes
 from imitarm.scene import Obstacle, Scene
 from imitarm.validation import finite_number, sequence, whole_number
 
@@ -26,7 +27,6 @@ Indices = NDArray[np.intp]
 _NO_ROWS = np.zeros((0, 15))
 _RESET = 10.0  # [s] a stamp that goes back by more was given by another clock
 _RECENT = 300  # updates whose innovations are kept
-_FULL_COUNT = 10  # detections after which a size is smoothed with a fixed weight
 
 
 class _Step(NamedTuple):
@@ -256,20 +256,47 @@ class ObstacleTracker:
         """Return the tracks after one update."""
         given = detections
         table = np.array([d.row for d in detections]) if detections else _NO_ROWS
-        measured = self._measurements(detections, table)
-        tracks = tracks.at(stamp)
-        apart = self._merged(detections, measured)
-        if apart is not None:
-            detections, table = tuple([detections[i] for i in apart.tolist()]), table[apart]
-            measured = measured.rows(apart)
-        pairs = self._assigned(tracks, detections, measured)
-        tracks = self._corrected(tracks, stamp, pairs, detections, measured, table[:, 12:])
+        compiled = self._compiled(tracks, stamp, detections, table)
+        if compiled is None:
+            measured = self._measurements(detections, table)
+            tracks = tracks.at(stamp)
+            apart = self._merged(detections, measured)
+            if apart is not None:
+                detections, table = tuple([detections[i] for i in apart.tolist()]), table[apart]
+                measured = measured.rows(apart)
+            pairs = self._assigned(tracks, detections, measured)
+            belief = self._corrected(tracks.belief, pairs, measured)
+        else:
+            belief, pairs = compiled
+            measured = Measurements(table[:, :3], table[:, 3:12].reshape(-1, 3, 3))
+        tracks = self._seen(tracks.changed(stamp=stamp, belief=belief), pairs, detections, table[:, 12:])
         tracks = self._pruned(tracks)
         if len(pairs.detections) < len(detections):
-            left = np.setdiff1d(np.arange(len(detections)), pairs.detections)
+            free = np.ones(len(detections), dtype=bool)
+            free[pairs.detections] = False
+            left = free.nonzero()[0]
             born = self._born(stamp, [detections[i] for i in left.tolist()], measured.rows(left))
             tracks = self._fitted(tracks.joined(born))
         return _Step(stamp, given, self._confirmed(tracks), pairs.distances)
+
+    def _compiled(
+        self, tracks: Tracks, stamp: float, detections: tuple[Detection, ...], table: Array
+    ) -> tuple[Belief, Pairs] | None:
+        """Return beliefs and pairs from compiled code; None if it is not built, or can't decide the assignment."""
+        if len(self.filter.orders) > 1 or self.motion == "ekf" or not len(tracks):
+            return None
+        mean, covariance, weights = tracks.belief
+        dt, (noise,) = stamp - tracks.stamp, self.filter.noise
+        found = updated(mean, covariance, tracks.ids != UNCONFIRMED, dt, noise, table, self.gate, self.max_speed)
+        if found is None:
+            return None
+        index, labels = found[2], tracks.labels
+        if any(labels):
+            for label, i in zip(labels, index.tolist(), strict=True):
+                if i >= 0 and label != (other := detections[i].label) and label and other:
+                    return None
+        rows = (index >= 0).nonzero()[0]
+        return Belief(found[0], found[1], weights), Pairs(rows, index[rows], found[3][rows])
 
     def _measurements(self, detections: tuple[Detection, ...], table: Array) -> Measurements:
         """Return the detections, whose rows are ``table`` (k, 15), as measurements."""
@@ -300,7 +327,7 @@ class ObstacleTracker:
         """Return the assignment; confirmed tracks choose first."""
         if not len(tracks) or not detections:
             return NO_PAIRS
-        allowed = _matching_labels(tracks.labels, [d.label for d in detections])
+        allowed = matching_labels(tracks.labels, [d.label for d in detections])
         mean, covariance = tracks.moments
         mean, covariance = mean[:, :3], covariance[:, :3, :3]
         if tracks.all_confirmed:
@@ -316,27 +343,26 @@ class ObstacleTracker:
             pairs = pairs.joined(found)
         return pairs.in_order()
 
-    def _corrected(
-        self,
-        tracks: Tracks,
-        stamp: float,
-        pairs: Pairs,
-        detections: tuple[Detection, ...],
-        measured: Measurements,
-        sizes: Array,
-    ) -> Tracks:
-        """Return the tracks after the assigned detections, which have these ``sizes`` (m, 3) [m]."""
+    def _corrected(self, belief: Belief, pairs: Pairs, measured: Measurements) -> Belief:
+        """Return the beliefs after the assigned measurements."""
+        rows = pairs.tracks
+        if not len(rows):
+            return belief
+        every = len(rows) == len(belief.mean)  # then the rows are in order
+        before = belief if every else belief.rows(rows)
+        after = self.filter.update(before, measured.rows(pairs.detections), pairs.innovation)
+        self._cap(after.mean)
+        return after if every else belief.replaced(rows, after)
+
+    def _seen(self, tracks: Tracks, pairs: Pairs, detections: tuple[Detection, ...], sizes: Array) -> Tracks:
+        """Return the tracks with what else the assigned detections say; their ``sizes`` are (m, 3) [m]."""
         hits, ages = tracks.hits << 1 & (1 << self.confirm[1]) - 1, tracks.ages + 1
         rows, columns = pairs.tracks, pairs.detections
         if not len(rows):
             return tracks.changed(hits=hits, ages=ages)
         hits[rows] |= 1
-        every = len(rows) == len(tracks)  # then the rows are in order
-        before = tracks.belief if every else tracks.belief.rows(rows)
-        belief = self.filter.update(before, measured.rows(columns), pairs.innovation)
-        self._cap(belief.mean)
         last_seen, counts = tracks.last_seen.copy(), tracks.counts.copy()
-        last_seen[rows] = stamp
+        last_seen[rows] = tracks.stamp
         seen, labels = list(tracks.detections), list(tracks.labels)
         for row, index in zip(rows.tolist(), columns.tolist(), strict=True):
             detection = detections[index]
@@ -346,11 +372,10 @@ class ObstacleTracker:
             labels[row] = detection.label or labels[row]
         counts[rows] += 1
         return tracks.changed(
-            belief=belief if every else tracks.belief.replaced(rows, belief),
             hits=hits,
             ages=ages,
             last_seen=last_seen,
-            sizes=_smoothed(tracks.sizes, rows, sizes[columns], counts),
+            sizes=smoothed_sizes(tracks.sizes, rows, sizes[columns], counts),
             counts=counts,
             detections=tuple(seen),
             labels=tuple(labels),
@@ -413,16 +438,6 @@ class ObstacleTracker:
         return tracks.changed(ids=ids, next_id=tracks.next_id + count)
 
 
-def _smoothed(sizes: Array, rows: Indices, measured: Array, counts: NDArray[np.int64]) -> Array:
-    """Return the sizes (n, 3) after new measurements (k, 3) of the tracks ``rows``, the mean of the last ones."""
-    error = measured - sizes[rows]
-    if not error.any():
-        return sizes
-    smoothed = sizes.copy()
-    smoothed[rows] += error / np.minimum(counts[rows], _FULL_COUNT)[:, None]
-    return smoothed
-
-
 def _checked_confirm(confirm: object) -> tuple[int, int]:
     if not isinstance(confirm, tuple | list) or len(confirm) != 2:
         raise InputError(f"ObstacleTracker: confirm must be two numbers (hits, updates), got {confirm!r}")
@@ -433,10 +448,3 @@ def _checked_confirm(confirm: object) -> tuple[int, int]:
 def _accuracy(detection: Detection) -> tuple[float, ...]:
     """Return a key by which detections are sorted, the most accurate first, whatever their order was."""
     return (float(np.trace(detection.covariance)), *detection.position.tolist())
-
-
-def _matching_labels(labels: Sequence[str], others: Sequence[str]) -> NDArray[np.bool_] | None:
-    """Return which labels may belong to the same obstacle, shape (n, m); None: all."""
-    if not any(labels) or not any(others):
-        return None
-    return np.array([[not a or not b or a == b for b in others] for a in labels])

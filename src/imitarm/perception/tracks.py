@@ -17,6 +17,7 @@ from imitarm.validation import finite_number
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
+_FULL_COUNT = 10  # detections after which a size is smoothed with a fixed weight
 UNCONFIRMED = -1  # the number of a track that is not confirmed yet
 
 
@@ -219,3 +220,13 @@ class TrackedObstacle:
                 "stamp, last seen": f"{self.stamp:.3f} s, {self.last_seen:.3f} s",
             },
         )
+
+
+def smoothed_sizes(sizes: Array, rows: Indices, measured: Array, counts: NDArray[np.int64]) -> Array:
+    """Return the sizes (n, 3) after new measurements (k, 3) of the tracks ``rows``, the mean of the last ones."""
+    error = measured - sizes[rows]
+    if not error.any():
+        return sizes
+    smoothed = sizes.copy()
+    smoothed[rows] += error / np.minimum(counts[rows], _FULL_COUNT)[:, None]
+    return smoothed

@@ -142,15 +142,11 @@ class Prediction(NamedTuple):
 
     Attributes:
         centers: centres of the tool's spheres without coupling, shape (R, H, S, 3) [m].
-        free: deviations without coupling, shape (H, 3) [m].
-        precision: Theta, shape (R, H, 3, 3).
         arrived: whether the phase is at its end, shape (R, H).
         goal: centres of the tool's spheres at the goal, shape (S, 3) [m].
     """
 
     centers: Array
-    free: Array
-    precision: Array
     arrived: NDArray[np.bool_]
     goal: Array
 
@@ -182,12 +178,13 @@ class LeastCost:
     r"""Choose the coupling acceleration u and the speed r of the phase with the least predicted cost.
 
     .. math::
-        J(u, r) = \sum_{m=1}^{H} \gamma^m \left[ \tfrac12 w_e\, e_m^T \Theta_m e_m + \sum_i b_i(\xi_m + e_m, m) \right]
+        J(u, r) = \sum_{m=1}^{H} \gamma^m \left[ \tfrac12 w_e\, e_m^T \Theta e_m + \sum_i b_i(\xi_m + e_m, m) \right]
         + w_\Delta \|\hat u - \hat u_{prev}\|^2 + w_u \|\hat u\|^2 + w_r (1 - r)^2, \qquad \hat u = u / a_{max}
 
     This is thesis Eq 5.5, corrected: the task cost instead of the trajectory, an obstacle cost b that falls with the
-    distance, and a horizon over which both are summed. The candidates are u = 0, and three sizes of u in each heading.
-    The speeds are those of ``rates``: to wait (r = 0) and to go back (r < 0) are candidates like the others.
+    distance, and a horizon over which both are summed. The precision Theta is that of the current phase. The candidates
+    are u = 0, and three sizes of u in each heading. The speeds are those of ``rates``: to wait (r = 0) and to go back
+    (r < 0) are candidates like the others.
 
     The result is the least cost of all candidates at all speeds, but few distances are computed. No candidate costs
     less than its cost without the obstacles, and an obstacle that the tool can't reach until an instant costs nothing
@@ -241,6 +238,13 @@ class LeastCost:
         return self.max_acceleration * self.response.G
 
     @cached_property
+    def _task(self) -> tuple[Array, Array, float]:
+        """Weights of the deviations (H,), the same times the gains (H,), and the sum of the same times the gains."""
+        task = self.deviation_weight * self._weights
+        pull = task * self._gains
+        return task, pull, float(pull.dot(self._gains))
+
+    @cached_property
     def _candidates(self) -> tuple[Array, Array]:
         """All candidates u / a_max in the frame of the motion (C, d), and the cost of their size (C,)."""
         zero = np.zeros((1, self.units.shape[1]))
@@ -257,8 +261,8 @@ class LeastCost:
         """Largest deviation within the horizon because of u [m]."""
         return float(self._gains[-1])
 
-    def smooth_costs(self, scaled: Array, sizes: Array, previous: Array, prediction: Prediction) -> Array:
-        """Return the costs of C candidates at R speeds without those of obstacles and waiting, shape (R, C).
+    def smooth_costs(self, scaled: Array, sizes: Array, previous: Array, free: Array, precision: Array) -> Array:
+        """Return the costs of C candidates without those of obstacles and waiting, shape (C,).
 
         The task cost is a quadratic form in u, so the deviations of the candidates are not needed.
 
@@ -266,26 +270,25 @@ class LeastCost:
             scaled: u / a_max of the candidates, shape (C, 3).
             sizes: cost of their sizes, shape (C,).
             previous: u / a_max of the last choice, shape (3,).
-            prediction: motion without coupling.
+            free: deviations without coupling, shape (H, 3) [m].
+            precision: Theta, shape (3, 3).
         """
-        task = self.deviation_weight * self._weights
-        pull = task * self._gains
-        n = len(prediction.precision)
-        pulled = np.matmul(prediction.precision, prediction.free[:, :, None])[..., 0]
-        constant = 0.5 * (np.sum(pulled * prediction.free, axis=2) @ task) + self.change_weight * previous.dot(previous)
-        slope = np.matmul(pull, pulled) - 2.0 * self.change_weight * previous
-        curvature = (pull * self._gains) @ prediction.precision.reshape(n, -1, 9)
-        squares = (scaled[:, :, None] * scaled[:, None, :]).reshape(-1, 9)
-        cost: Array = slope @ scaled.T + 0.5 * (curvature @ squares.T)
-        cost += constant[:, None]
-        cost += sizes
-        return cost
+        task, pull, curvature = self._task
+        pulled = free.dot(precision)
+        constant = 0.5 * float(task.dot(np.add.reduce(pulled * free, axis=1)))
+        constant += self.change_weight * float(previous.dot(previous))
+        slope = pull.dot(pulled) - 2.0 * self.change_weight * previous
+        bent = scaled.dot(precision)
+        bent *= scaled
+        return np.asarray(scaled.dot(slope) + (0.5 * curvature) * np.add.reduce(bent, axis=1) + (sizes + constant))
 
     def choose(
         self,
         axes: Array,
         one_sided: Array,
         previous: Array,
+        free: Array,
+        precision: Array,
         predict: Callable[[Array], Prediction],
         obstacles: PredictedObstacles,
     ) -> Choice:
@@ -295,6 +298,8 @@ class LeastCost:
             axes: frame of the motion, shape (3, d).
             one_sided: directions in which u must have no component, shape (m, 3).
             previous: u / a_max of the last choice, shape (3,).
+            free: deviations without coupling, shape (H, 3) [m].
+            precision: Theta at the current phase, shape (3, 3).
             predict: returns the motion without coupling for speeds of the phase, shape (R,).
             obstacles: the obstacles that may come near.
         """
@@ -303,15 +308,16 @@ class LeastCost:
         if len(one_sided):
             allowed = (scaled @ one_sided.T <= 1e-9).all(axis=1)
             scaled, sizes = scaled[allowed], sizes[allowed]
-        best: Choice | None = None
+        smooth = self.smooth_costs(scaled, sizes, previous, free, precision)
+        least, best = float(smooth.min()), None
         for begin, end in ((0, 1), (1, len(self.rates))):
             waiting = self._waiting[begin:end]
-            if best is not None and (waiting.min(initial=math.inf) > best.cost):
+            bound = math.inf if best is None else best.cost
+            if least + waiting.min(initial=math.inf) > bound:
                 break
             prediction = predict(np.array(self.rates[begin:end]))
-            smooth = self.smooth_costs(scaled, sizes, previous, prediction) + waiting[:, None]
-            found = self._best(scaled, smooth, prediction, obstacles, math.inf if best is None else best.cost)
-            if found is not None and (best is None or found[2] < best.cost - _TIED):
+            found = self._best(scaled, smooth + waiting[:, None], prediction, obstacles, bound)
+            if found is not None and found[2] < bound - _TIED:
                 rate, index, cost, nearest, gap = found
                 best = Choice(scaled[index], self.rates[begin + rate], cost, nearest, gap)
         assert best is not None

@@ -6,7 +6,8 @@ import math
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import KDTree
 
 from imitarm.command import Command, Status
 from imitarm.errors import InputError
@@ -19,10 +20,11 @@ from imitarm.kinematics.pose import (
 )
 from imitarm.perception.margins import CoverageMargin
 from imitarm.policies.least_cost import STAY, Choice, LeastCost, Prediction, Response, allowed_axes, frame, headings
-from imitarm.policies.obstacle_cost import DistanceCost, GaussianCost, ObstacleCost, PredictedObstacles
+from imitarm.policies.obstacle_cost import DistanceCost, GaussianCost, Groups, ObstacleCost, PredictedObstacles
 from imitarm.policies.policy import Observation, Policy
 from imitarm.policies.primitive_path import PrimitivePath, learned_precision
 from imitarm.scene.distances import distances
+from imitarm.scene.scene import Scene
 from imitarm.skills.dmp import DMP
 from imitarm.skills.dynamical_systems import Gains
 from imitarm.skills.skill import Skill
@@ -113,6 +115,7 @@ class RCAMO(Policy):
         limit = finite_number(max_acceleration, "RCAMO: max_acceleration", "m/s^2", above=0.0)
         spheres = np.zeros((1, 4)) if self.tool_spheres is None else self.tool_spheres
         self._spheres = spheres[:, :3]
+        self._offset_spheres = bool(self._spheres.any())
         self._tool_radius = float(np.max(np.linalg.norm(spheres[:, :3], axis=1) + spheres[:, 3]))
         forbidden = finite_array(np.reshape(np.asarray(self.forbidden, dtype=float), (-1, 3)), (None, 3), "forbidden")
         self._axes, rest = allowed_axes(forbidden / np.linalg.norm(forbidden, axis=1, keepdims=True))
@@ -223,8 +226,8 @@ class RCAMO(Policy):
 
     def _phases(self, rates: Array, times: Array) -> Array:
         """Return the phases at ``times`` (H,) [s] from now, when the phase takes up speeds (R, 1), shape (R, H)."""
-        transient = _RATE_TIME * (1.0 - np.exp(times / -_RATE_TIME))
-        return np.asarray(self._phase + (rates * times + (self._rate - rates) * transient) / self._dmp.duration_)
+        transient = (_RATE_TIME / self._dmp.duration_) * (1.0 - np.exp(times / -_RATE_TIME))
+        return np.asarray(self._phase + rates * (times / self._dmp.duration_) + (self._rate - rates) * transient)
 
     def _choose(self, path: PrimitivePath, lag: Array, near: _Near | None) -> Choice:
         if near is None:
@@ -233,18 +236,20 @@ class RCAMO(Policy):
         least_cost, times = self.least_cost, self.least_cost.times
         free = least_cost.response.free(self._deviation) + least_cost.response.A[:, None] * lag
 
-        goal = path.goal.position + self._offsets(path, path.nearest(np.ones((1, 1))))[0, 0]
+        goal = path.goal.position[None]
+        if self._offset_spheres:
+            goal = goal + self._offsets(path, np.full((1, 1), -1))[0, 0]
+        precision = path.precision[round(self._phase * (len(path.precision) - 1))]
 
         def predict(rates: Array) -> Prediction:
             phases = self._phases(rates[:, None], times)
-            samples = path.nearest(phases)
             centers = (path.positions_at(phases) + free)[:, :, None]
-            if self._spheres.any():
-                centers = centers + self._offsets(path, samples)
-            return Prediction(centers, free, path.precision[samples], phases >= 1.0, goal)
+            if self._offset_spheres:
+                centers = centers + self._offsets(path, path.nearest(phases))
+            return Prediction(centers, phases >= 1.0, goal)
 
         axes = frame(path.tangent(self._phase), self._axes)
-        chosen = least_cost.choose(axes, self._one_sided, self._scaled, predict, near.obstacles)
+        chosen = least_cost.choose(axes, self._one_sided, self._scaled, free, precision, predict, near.obstacles)
         self._scaled = chosen.scaled
         return chosen
 
@@ -328,6 +333,42 @@ class RCAMO(Policy):
             reason = f"the tool is {1e3 * deviation:.0f} mm from its path because of {self._reason}"
             return Command(twist, progress=self._phase, status=Status.AVOIDING, reason=reason)
         return Command(twist, progress=self._phase)
+
+    def cost_field(self, scene: Scene, points: ArrayLike) -> Array:
+        r"""Return the cost of the tool at points, for drawing: the cost of thesis Eq 5.1, corrected.
+
+        .. math:: J^G(\chi) = \tfrac12 w_e\,(\chi - \xi)^T \Theta\,(\chi - \xi) + \sum_i b_i(\chi)
+
+        The motion xi is represented by its point nearest to each chi, and the obstacles by their poses in the scene.
+
+        Args:
+            scene: goal and obstacles at one time.
+            points: positions of the tool's tip, shape (..., 3) [m]; the tool is not rotated against the learned start.
+
+        Returns:
+            Shape (...).
+        """
+        chi = finite_array(points, (..., 3), "RCAMO.cost_field: points", "m")
+        flat = chi.reshape(-1, 3)
+        path = PrimitivePath.of(self._dmp, self._precision, None, scene.goal)
+        nearest = KDTree(path.positions).query(flat)[1]
+        away = flat - path.positions[nearest]
+        pulled = np.matmul(path.precision[nearest], away[:, :, None])[..., 0]
+        cost = 0.5 * self.least_cost.deviation_weight * np.sum(away * pulled, axis=1)
+        turned = np.eye(3) if path.rotations is None else path.rotations[0]
+        packed = scene.packed
+        obstacles = PredictedObstacles(packed, np.zeros(1), np.zeros((len(packed), 1)))
+        still = np.zeros(len(flat)), np.zeros((1, 3))
+        for i in range(len(packed)):
+            values = []
+            for j, offset in enumerate(self._spheres @ turned.T):
+                groups = Groups(*(np.full(len(flat), index, dtype=np.intp) for index in (i, 0, j)))
+                gaps = self.least_cost.obstacle_cost.gaps(obstacles, groups, flat + offset, *still)
+                values.append(
+                    self.least_cost.obstacle_cost.values(obstacles, groups, flat + offset, *still, gaps)[:, 0]
+                )
+            cost += np.max(values, axis=0)
+        return np.asarray(cost.reshape(chi.shape[:-1]))
 
     def finished(self, observation: Observation) -> bool:
         """Return whether the phase is at its end, and the tool is nearer than ``arrival`` to the goal."""
