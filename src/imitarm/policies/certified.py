@@ -13,11 +13,13 @@ The algorithm of :func:`find_detour`:
    passes each obstacle on the chosen side.
 3. **Certificate** (:mod:`~imitarm.policies.certificate`): a lower bound of the distance on the whole path, not only at
    samples.
-4. If the search over sides finds no path, a second search treats all samples together. It takes routes from a roadmap
+4. If the search over sides finds no path, a grid of positions (:mod:`~imitarm.policies.passages`) often proves that
+   there is none. Otherwise, a second search treats all samples together. It takes routes from a roadmap
    (:mod:`~imitarm.policies.roadmap`), and follows each route first with the learned components, then with more and
-   narrower ones. If components can move only in a plane, the roadmap is built earlier: as soon as the next choice of
-   sides costs more than 70 % of the previous choice. Then the roadmap decides: if it contains no route, the search over
-   sides ends, otherwise the search over sides continues.
+   narrower ones. If components can move only in a plane, the grid and the roadmap are built earlier: as soon as the
+   next choice of sides costs more than 70 % of the previous choice. Then they decide: if there is no route, the search
+   over sides ends, otherwise the search over sides continues. If no route of the roadmap leads to a path, a last
+   attempt follows the cheapest chain of the grid's cells.
 5. If the path is displaced by more than twice the depth by which the learned path violates the clearance, the learned
    components are too wide for this scene, or the side is not a good one. A route of the roadmap is then followed with
    narrower components, and the path with the smaller mean deviation from the demonstrations is returned.
@@ -26,7 +28,9 @@ The algorithm of :func:`find_detour`:
 from __future__ import annotations
 
 import heapq
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +48,7 @@ from imitarm.policies.least_detour import (
     best_of,
     least_norm,
 )
+from imitarm.policies.passages import Passages
 from imitarm.policies.roadmap import Roadmap
 
 Array = NDArray[np.float64]
@@ -97,38 +102,88 @@ def find_detour(path: ComponentPath, nominal: PathClearance, clearance: float, a
     Returns:
         The detour; when it is not feasible, the best attempt with its bounds.
     """
-    tool, search = nominal.tool, _SideSearch(path, nominal, clearance, allowed)
+    search = _SideSearch(path, nominal, clearance, allowed)
+    around = _Surroundings(path, nominal.tool, clearance, allowed)
     best = search.run(while_cheaper=allowed.dimension < 3)
-    roadmap: Roadmap | None = None
-    if best is None:  # in a plane the roadmap costs no more than further sides, and often shows that there is no path
-        roadmap = _roadmap(path, tool, clearance, allowed)
-        best = search.best() if roadmap.is_hopeless else search.run()
+    if best is None:  # in a plane, this costs no more than further sides, and often shows that there is no path
+        best = search.best() if around.are_closed or around.roadmap.is_hopeless else search.run()
     assert best is not None
     if not allowed.dimension or (best.feasible and not _strays(best, nominal, clearance)):
         return best
-    divided = LeastDetour(path.divided, tool, clearance, allowed, exact=True)
     if best.feasible:
-        roadmap = roadmap or _roadmap(path, tool, clearance, allowed)
-        start = best.clearance
+        return _nearer(best, around)
+    return best if around.are_closed else _followed(best, around)
+
+
+@dataclass(frozen=True, eq=False)
+class _Surroundings:
+    """What is known about the free space around one path; each part is computed when it is first needed."""
+
+    path: ComponentPath
+    tool: ToolAmongObstacles
+    clearance: float
+    allowed: AllowedDirections
+
+    @cached_property
+    def roadmap(self) -> Roadmap:
+        """A roadmap with a route, if possible by rays that are aimed at gaps between the obstacles."""
+        roadmap = Roadmap(self.path, self.tool, self.clearance, self.allowed)
         if not roadmap.is_hopeless:
-            start = tool.clearance_of(path.nominal.positions + next(roadmap.routes(1)))
-        nearer = divided.shrink(start)
-        return best if nearer is None or not nearer.feasible else min(best, nearer, key=_deviation)
-    if best.lowest > clearance - _ALMOST:
-        best = best_of((best, divided.shrink(best.clearance))) or best
+            return roadmap
+        return Roadmap(self.path, self.tool, self.clearance, self.allowed, aimed=True)
+
+    @cached_property
+    def passages(self) -> Passages | None:
+        """The passages between obstacles; None if components can move in less than two dimensions."""
+        few = self.allowed.dimension < 2
+        return None if few else Passages(self.path, self.tool, self.clearance, self.allowed)
+
+    @property
+    def are_closed(self) -> bool:
+        """Whether there is provably no path."""
+        return self.passages is not None and self.passages.are_closed
+
+    def least(self, path: ComponentPath) -> LeastDetour:
+        """Return the search for the least detour with the components of ``path``."""
+        return LeastDetour(path, self.tool, self.clearance, self.allowed, exact=True)
+
+    def along(self, route: Array) -> PathClearance:
+        """Return the clearance along a route, given by its displacements (n, 3) [m]."""
+        return self.tool.clearance_of(self.path.nominal.positions + route)
+
+
+def _nearer(best: Detour, around: _Surroundings) -> Detour:
+    """Return a feasible detour that is divided and follows the roadmap, if it is nearer than the feasible ``best``."""
+    start = best.clearance
+    if not around.roadmap.is_hopeless:
+        start = around.along(next(around.roadmap.routes(1)))
+    nearer = around.least(around.path.divided).shrink(start)
+    return best if nearer is None or not nearer.feasible else min(best, nearer, key=_deviation)
+
+
+def _followed(best: Detour, around: _Surroundings) -> Detour:
+    """Return the first feasible detour that is found along proposed routes; if there is none, the best attempt."""
+    for start, pieces in _proposals(best, around):
+        best = best_of((best, around.least(pieces).shrink(start))) or best
         if best.feasible:
-            return best
-    roadmap = roadmap or _roadmap(path, tool, clearance, allowed)
-    if roadmap.is_hopeless:
-        return best
-    learned = LeastDetour(path, tool, clearance, allowed, exact=True)
-    for route in roadmap.routes(_MAX_ROUTES):
-        start = tool.clearance_of(path.nominal.positions + route)
-        for least in (learned, divided):
-            best = best_of((best, least.shrink(start))) or best
-            if best.feasible:
-                return best
+            break
     return best
+
+
+def _proposals(best: Detour, around: _Surroundings) -> Iterator[tuple[PathClearance, ComponentPath]]:
+    """Yield the clearance along proposed routes, with the components that are to follow each of them."""
+    path = around.path
+    if best.lowest > around.clearance - _ALMOST:
+        yield best.clearance, path.divided
+    for route in () if around.roadmap.is_hopeless else around.roadmap.routes(_MAX_ROUTES):
+        along = around.along(route)
+        yield along, path
+        yield along, path.divided
+    passage = None if around.passages is None else around.passages.route()
+    if passage is not None:
+        along = around.along(passage)
+        yield along, path.divided
+        yield along, path.finely_divided
 
 
 def _strays(detour: Detour, nominal: PathClearance, clearance: float) -> bool:
@@ -146,12 +201,6 @@ def _deviation(detour: Detour) -> float:
     path, away = detour.path, detour.clearance.positions - detour.path.nominal.positions
     covariance = path.tolerance + TOLERANCE_FLOOR**2 * np.eye(3)
     return float(np.einsum("nd,nd->n", away, np.linalg.solve(covariance, away[..., None])[..., 0]).mean())
-
-
-def _roadmap(path: ComponentPath, tool: ToolAmongObstacles, clearance: float, allowed: AllowedDirections) -> Roadmap:
-    """Return a roadmap with a route, if possible by rays that are aimed at gaps between the obstacles."""
-    roadmap = Roadmap(path, tool, clearance, allowed)
-    return Roadmap(path, tool, clearance, allowed, aimed=True) if roadmap.is_hopeless else roadmap
 
 
 @dataclass(order=True)

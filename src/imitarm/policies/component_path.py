@@ -30,6 +30,7 @@ NEGLIGIBLE_RESPONSIBILITY = 1e-6  # below this a component's influence is cut, s
 STILL = 1e-6  # [m] a mean that would move less than this stays exactly where it is
 TOLERANCE_FLOOR = 0.005  # [m] nobody demonstrates more precisely than this: keeps planar covariances invertible
 _PIECES = 24  # a divided path has a piece about every 24th of the duration, and narrower ones at its ends
+_FINE_PIECES = 48  # likewise of a finely divided path
 _NARROWEST_PIN = 0.015  # fraction of the duration over which the pieces fade towards a fixed time between the ends
 
 
@@ -197,6 +198,15 @@ class ComponentPath:
 
     @cached_property
     def divided(self) -> ComponentPath:
+        """The same path with more, narrower components."""
+        return self._divided(_PIECES)
+
+    @cached_property
+    def finely_divided(self) -> ComponentPath:
+        """The same path with still narrower components, for sharp bends."""
+        return self._divided(_FINE_PIECES)
+
+    def _divided(self, n_pieces: int) -> ComponentPath:
         """Return the same path with more, narrower components.
 
         For some scenes, the influence of the Gaussians extends too far, for example near the start or the goal, or in
@@ -205,7 +215,7 @@ class ComponentPath:
         would move the start and the goal. The knots are closer together near the fixed times.
         """
         times, fixed = self.nominal.times, self.fixed_times
-        knots = np.concatenate([[times[0]] * 3, _knots(times, fixed), [times[-1]] * 3])
+        knots = np.concatenate([[times[0]] * 3, _knots(times, fixed, n_pieces), [times[-1]] * 3])
         pieces = BSpline.design_matrix(times, knots, 3).toarray()[:, 1:-1]
         pieces[[0, -1]] = 0.0
         basis = pieces
@@ -285,10 +295,10 @@ def _window(times: Array, fixed_times: Sequence[float], width: float) -> Array:
     return quintic_step(distance / (width * (times[-1] - times[0])))
 
 
-def _knots(times: Array, fixed_times: Sequence[float]) -> Array:
-    """Return the sample indices of the knots: about ``_PIECES`` evenly spaced ones, and more near each fixed time."""
+def _knots(times: Array, fixed_times: Sequence[float], n_pieces: int) -> Array:
+    """Return the sample indices of the knots: about ``n_pieces`` evenly spaced ones, and more near each fixed time."""
     last = len(times) - 1
-    widest = max(last / _PIECES, 1.0)
+    widest = max(last / n_pieces, 1.0)
     fixed = np.unique(np.searchsorted(times, fixed_times)).tolist()
     knots = set(fixed)
     for start, end in pairwise(fixed):
