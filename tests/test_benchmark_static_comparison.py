@@ -19,6 +19,7 @@ from imitarm.benchmark.static_results import ResultLines, json_line, read_lines
 from imitarm.benchmark.static_scaling import Plan, exponent, plan_once, scaling_case
 from imitarm.benchmark.static_tables import (
     StaticResults,
+    checked_refusals_table,
     obstacles_table,
     refusals_table,
     row_name,
@@ -264,6 +265,41 @@ def test_the_scaling_command_prints_exponents(capsys):
     printed = capsys.readouterr().out
     assert "number of obstacles" in printed and "number of spheres" in printed and "exponent" in printed
     assert cli.main([*words, "magic"]) == 2
+
+
+def test_every_refusal_is_checked_and_counted_in_its_family():
+    found = [result("acfra", s, o, family="S4") for s, o in enumerate(["refused", "refused", "refused", "success"])]
+    found += [
+        replace(oracle(s, a, plan_cpu=0.1 + s), experiment=replace(found[s].experiment, method="oracle"))
+        for s, a in enumerate(["impossible", "possible", "undecided"])
+    ]
+    found.append(result("acfra", 9, "success"))
+    table = checked_refusals_table(StaticResults(found))
+    rows = rows_of(table)
+    for family, scenes in (("S4, 2-D", "4"), ("all", "5")):
+        row = rows[family]
+        assert [row[c] for c in ("scenes>", "refused>", "right>", "wrong>", "undecided>")] == [
+            scenes,
+            "3",
+            "1",
+            "1",
+            "1",
+        ]
+        assert row["right % (95 %)>"].startswith("33.3")
+        assert row["oracle, longest [s]>"] == "2.10"
+    assert rows["S1, 2-D"]["refused>"] == "0"
+    assert "S4, 2-D, seed 1 (possible); S4, 2-D, seed 2 (undecided)" in table.note
+
+
+def test_the_command_checks_every_refusal(tmp_path, capsys):
+    words = ["benchmark", "static", "refusals", "--count", "1", "--first", "1000", "--dimensions", "2"]
+    out = ["--out", str(tmp_path / "out")]
+    document = tmp_path / "doc.md"
+    document.write_text(f"<!-- imitarm benchmark static refusals -->\n{END}\n")
+    assert cli.main([*words, *out, "--families", "S1", "S6", "--fill", str(document)]) == 0
+    assert "| S6, 2-D | 1 | 1 | 1 | 0 | 0 |" in document.read_text()
+    assert cli.main([*words, *out, "--families", "S1"]) == 0  # nothing is refused
+    assert "none" in capsys.readouterr().out
 
 
 # --- a small part, against saved results -------------------------------------------------------------------------

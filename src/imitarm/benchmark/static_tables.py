@@ -250,6 +250,56 @@ def refusals_table(results: StaticResults) -> Table:
     return Table("Refusals", columns, tuple(rows), "A method that never refuses moves in impossible scenes as well.")
 
 
+def checked_refusals_table(results: StaticResults, row: str = OURS) -> Table:
+    """Return a table of the refusals of one method, each checked by the oracle, for each family.
+
+    Args:
+        results: the results. The oracle must have been run wherever the method refused.
+        row: the method.
+    """
+    rows, doubtful = [], []
+    for family in [*results.families(), None]:
+        found = results.of(row, lambda s, f=family: results.usual(s) and f in (None, s[:2]))  # type: ignore[misc]
+        refused = [r.experiment.scene for r in found if r.outcome == "refused"]
+        checks = [results.by_scene[s][ORACLE] for s in refused if ORACLE in results.by_scene[s]]
+        answers = [str(check.values.get("answer")) for check in checks]
+        counts = [answers.count(kind) for kind in (IMPOSSIBLE, POSSIBLE, UNDECIDED)]
+        seconds = [check.value("plan_cpu") for check in checks]
+        if family is not None:
+            doubtful += [
+                f"{place(family)}, seed {check.experiment.seed} ({kind})"
+                for check, kind in zip(checks, answers, strict=True)
+                if kind != IMPOSSIBLE
+            ]
+        largest = f"{max(seconds):.2f}" if seconds else "–"
+        rows.append(
+            (
+                place(family),
+                *map(str, (len(found), len(refused), *counts)),
+                rate(counts[0], len(refused)),
+                percentile(seconds, 50, 1e3, 1),
+                largest,
+            )
+        )
+    columns = (
+        "family",
+        "scenes>",
+        "refused>",
+        "right>",
+        "wrong>",
+        "undecided>",
+        "right % (95 %)>",
+        "oracle, median [ms]>",
+        "oracle, longest [s]>",
+    )
+    note = (
+        f"Every refusal of {row} was checked by the oracle. Right: the oracle proves that no path exists. Wrong: it "
+        "finds a path. An undecided refusal counts as not right. Times of the oracle: processor time of one scene. "
+        f"Refusals that are not right: {'; '.join(doubtful) or 'none'}."
+    )
+    return Table(f"Refusals of {row}", columns, tuple(rows), note)
+
+
 def quality_table(results: StaticResults) -> Table:
     """Return a table of the quality of the paths, over the successes of each method."""
     rows = []

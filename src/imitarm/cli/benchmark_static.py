@@ -6,18 +6,19 @@ import argparse
 import json
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from imitarm.benchmark.experiment import plain, write_text
 from imitarm.benchmark.provenance import code_version, origin
 from imitarm.benchmark.running import run_experiments
-from imitarm.benchmark.static import StaticExperiment, method_names, policy_class, run_experiment
+from imitarm.benchmark.static import StaticExperiment, StaticResult, method_names, policy_class, run_experiment
 from imitarm.benchmark.static_claims import cost_law, static_tables
 from imitarm.benchmark.static_results import ResultLines, read_folders
 from imitarm.benchmark.static_scaling import scaling_tables
 from imitarm.benchmark.static_scenes import FAMILIES, SPLITS
-from imitarm.benchmark.static_tables import OURS, StaticResults, success_table
+from imitarm.benchmark.static_tables import ORACLE, OURS, StaticResults, checked_refusals_table, success_table
 from imitarm.benchmark.static_tuning import DRAWS, Search, tune, tuned_options, write_tuned
 from imitarm.cli.benchmark_options import add_fill, add_workers, command_line, place_of, report_tables, workers_of
 from imitarm.cli.outputs import check_outputs
@@ -71,6 +72,11 @@ def add_static(parsers: Any) -> None:
     scaling.add_argument("--first", type=int, default=2000, metavar="N", help="first seed; default: 2000")
     add_fill(scaling)
     scaling.set_defaults(benchmark=_scaling)
+    refusals = actions.add_parser("refusals", help=f"check every refusal of {OURS} with the oracle")
+    _add_scenes(refusals, count=100, split="test", methods=False)
+    _add_running(refusals)
+    add_fill(refusals)
+    refusals.set_defaults(benchmark=_refusals)
     comparison = actions.add_parser("compare", help="print the tables of saved results")
     comparison.add_argument("folders", type=Path, nargs="+", metavar="FOLDER", help="folders of results")
     comparison.add_argument("--report", type=Path, metavar="FILE", help="write a page with figures and playback (HTML)")
@@ -87,10 +93,18 @@ def add_static(parsers: Any) -> None:
     comparison.set_defaults(benchmark=_compare)
 
 
-def _add_scenes(parser: argparse.ArgumentParser, *, count: int, split: str, families: Sequence[str] = FAMILIES) -> None:
-    parser.add_argument(
-        "--methods", nargs="+", metavar="NAME", help="policies that plan a whole path, and controls; default: all"
-    )
+def _add_scenes(
+    parser: argparse.ArgumentParser,
+    *,
+    count: int,
+    split: str,
+    families: Sequence[str] = FAMILIES,
+    methods: bool = True,
+) -> None:
+    if methods:
+        parser.add_argument(
+            "--methods", nargs="+", metavar="NAME", help="policies that plan a whole path, and controls; default: all"
+        )
     parser.add_argument(
         "--families",
         nargs="+",
@@ -209,6 +223,29 @@ def _scaling(arguments: argparse.Namespace) -> int:
             on_done=lambda done, of: bar.update(task, completed=done, total=of),
         )
     report_tables(tables, place, [code_version()])
+    return 0
+
+
+def _refusals(arguments: argparse.Namespace) -> int:
+    """Run the default method, check its refusals with the oracle, and print the counts for each family."""
+    place, workers = place_of(arguments, "static refusals"), workers_of(arguments)
+    store = ResultLines(arguments.out, reuse=arguments.reuse)
+    wanted = [StaticExperiment(*scene, OURS) for scene in _scenes(arguments)]
+    done: list[StaticResult] = []
+    with progress_bar() as bar:
+        for name in (OURS, ORACLE):
+            task = bar.add_task(name, total=len(wanted))
+            found = run_experiments(
+                wanted,
+                run_experiment,
+                store,
+                workers,
+                fresh=arguments.fresh,
+                on_done=lambda done, of, task=task: bar.update(task, completed=done, total=of),  # type: ignore[misc]
+            )
+            done += found
+            wanted = [replace(r.experiment, method=ORACLE) for r in found if r.outcome == "refused"]
+    report_tables([checked_refusals_table(StaticResults(done))], place, [r.code for r in done])
     return 0
 
 
