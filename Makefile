@@ -57,6 +57,7 @@ tables: $(VENV)/.dev $(MEDIAPIPE) $(SKILLS)  ## print all tables of docs/ again,
 	$(BIN)/imitarm benchmark static --count 100 --torque 10 --memory 10 --out benchmark-static
 	$(BIN)/imitarm benchmark static compare benchmark-static --fill docs/static_benchmark.md
 	$(BIN)/imitarm benchmark avoidance --seeds 200 --fill docs/avoidance.md
+	$(BIN)/imitarm benchmark tracking --data $(DATA) --fill docs/tracking.md
 	$(BIN)/imitarm benchmark placements --skill $(SKILLS) --robots sawyer panda --tool gripper --seeds 334 --max-tilt 30 \
 		--jobs $(JOBS) --fill docs/avoidance.md
 	$(BIN)/imitarm benchmark placements --policies acfra rrt-connect $(COMPARED) --seeds 50 --max-tilt 30
