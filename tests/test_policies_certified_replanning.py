@@ -163,6 +163,14 @@ def test_a_stop_in_the_way_of_an_obstacle_is_not_certified_and_names_it():
     assert not stop.certified
     assert "ball" in stop.reason
     assert certified_stop(arm, at(arm, start), Scene(None, [ball]), horizon=0.2).certified
+    centers, radii = arm.collision_spheres(start)
+    lowest = float((centers[:, 2] - radii)[arm.cover.links == arm.n_joints].min())
+    table = Box(Pose([tool[0], tool[1], lowest - 0.055], UPRIGHT), [0.3, 0.3, 0.1], name="table")
+    assert certified_stop(arm, at(arm, start), Scene(fixtures=[table])).certified
+    down = -np.linalg.pinv(arm.jacobian(start)[:3]) @ [0.0, 0.0, 1.0]
+    sinking = certified_stop(arm, at(arm, start, down), Scene(fixtures=[table]))
+    assert not sinking.certified
+    assert "table" in sinking.reason
     with pytest.raises(InputError, match="joints"):
         certified_stop(arm, ArmState(np.zeros(6), np.zeros(6), np.zeros(6), 0.0), Scene())
 

@@ -69,7 +69,8 @@ def certified_stop(
     Args:
         arm: the arm with its tool.
         state: measured state of the arm.
-        scene: obstacles now, with their velocities.
+        scene: obstacles now, with their velocities, and fixtures. A part of the arm that is nearer to a fixture than
+            ``clearance`` now may stay as near.
         clearance: required distance from the whole arm to every obstacle [m].
         horizon: time for which the certificate holds, from now [s].
         margin: bound of the error with which obstacles are predicted; see :func:`~imitarm.policies.adapt`.
@@ -90,16 +91,29 @@ def certified_stop(
         arm,
         scene.obstacles,
         clearance,
+        fixtures=scene.fixtures,
+        contacts=q[None],
         own=links_apart(arm),
         margins=margins_in(scene, margin, margin_horizon),
     )
     found = around.clearance_of(ArmPath.of(arm, joints), times)
     reason = ""
     if found.room < 0.0:
-        what = "another link" if found.obstacle == SELF else scene.name_of(found.obstacle)
+        what = _named(scene, found.obstacle)
         within = times[min(found.sample + 1, len(times) - 1)]
         reason = f"{arm.cover.bodies[found.sphere]} comes too close to {what} within {within:.2f} s"
     return Stop(times, joints, clearance + found.room, found.room >= 0.0, reason)
+
+
+def _named(scene: Scene, index: int) -> str:
+    """Return the name of an obstacle, or of a fixture, whose indices follow those of the obstacles."""
+    if index == SELF:
+        return "another link"
+    n = len(scene.obstacles)
+    if index < n:
+        return scene.name_of(index)
+    fixture = scene.fixtures[index - n]
+    return fixture.name or fixture.kind
 
 
 def _braking(q: Array, velocity: Array, deceleration: Array, horizon: float) -> tuple[Array, Array]:
