@@ -218,6 +218,24 @@ def test_a_new_obstacle_a_rotated_one_and_a_larger_one_are_unforeseen_and_a_miss
     assert plan.unforeseen(Scene(None, [], stamp=2.0)) == ""
 
 
+def test_a_plan_is_certified_again_for_obstacles_elsewhere_if_its_rest_is_clear_of_them():
+    plan, _, box = begun()
+    _, arm, _ = carrying("sawyer")
+    for shift, fits in (([0.0, 0.25, 0.0], True), (plan.trajectory.positions[-1] - box.pose.position, False)):
+        moved = replace(box.after(0.5), pose=Pose(box.after(0.5).pose.position + shift, UPRIGHT))
+        scene = Scene(None, [moved], stamp=2.5)
+        assert plan.unforeseen(scene)
+        again = plan.certified_again(arm, scene, margins_in(scene, MARGIN, 1.0), 0.5)
+        assert (again is not None) == fits
+        if again is not None:
+            assert again.unforeseen(scene) == ""
+            times = np.linspace(2.5, plan.end + 0.5, 200)
+            for time in times:
+                centers, radii = arm.collision_spheres(again.joints_at(time))
+                away = float((moved.after(time - 2.5).signed_distance(centers) - radii).min())
+                assert away >= again.certified + 0.005 + 0.02 * min(time - 2.5, 1.0) - 1e-6
+
+
 def test_the_time_in_the_learned_motion_and_the_phase_are_inverse():
     plan, _, _ = begun()
     for time in np.linspace(2.0, plan.end, 15):

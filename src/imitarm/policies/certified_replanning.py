@@ -57,8 +57,9 @@ class CertifiedRCAMO(Policy):
 
     to each predicted obstacle i (:mod:`~imitarm.policies.prediction_margin`). If the path can't pass an obstacle in
     time, a plan may wait until the obstacle has passed (:mod:`~imitarm.policies.retiming`). A plan is void as soon as
-    one of its assumptions fails (:mod:`~imitarm.policies.plan_in_execution`): the arm is off schedule, a new obstacle
-    has appeared, or an obstacle has left its margin. Another plan is then made at once. The policy acts as follows:
+    one of its assumptions fails (:mod:`~imitarm.policies.plan_in_execution`): the arm is off schedule, or an obstacle
+    is new or has left its margin, and the rest of the plan is not clear of it. Another plan is then made at once. The
+    policy acts as follows:
 
     1. A certified plan exists: the arm follows it.
     2. No plan is certified, but the arm can brake to rest and stay there for a while, which is certified
@@ -248,6 +249,10 @@ class CertifiedRCAMO(Policy):
             self._arm, time, observation.state, observation.tool_to_base, 0.5 * max(self.clearance, 0.01)
         )
         reason = late or plan.unforeseen(scene)
+        if reason and not late:
+            again = plan.certified_again(self._arm, scene, margins_in(scene, **self._margin), self._hold)
+            if again is not None:
+                plan, self._plan, reason = again, again, ""
         if not reason:
             self._learned = plan.learned_at(time)
             return False

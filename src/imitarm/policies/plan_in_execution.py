@@ -8,20 +8,25 @@ the plan predicted it. With the certified clearance :math:`c_0 \ge c`, an obstac
 Here :math:`p_i` is the position as seen now, :math:`\hat p_i` the position that the plan predicted for now,
 :math:`r_i` the radius of a sphere that contains the obstacle, :math:`\theta_i` the angle between the seen and the
 predicted rotation, and :math:`s_i` the growth of the largest size since then. Then the distance is still at least c.
+
+Where this does not hold, the rest of the plan may still be clear of the obstacles as they are seen now. The certificate
+is then made again for the same motion, which takes a fraction of the time of planning.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.kinematics.arm import ArmModel, ArmState
+from imitarm.kinematics.arm_path import ArmPath
 from imitarm.kinematics.pose import Pose, quaternion_conjugate, quaternion_log, quaternion_multiply
 from imitarm.policies.adapted_path import Adaptation
+from imitarm.policies.arm_certificate import ArmAmongObstacles
 from imitarm.policies.prediction_margin import PredictionMargin
 from imitarm.scene.scene import Scene
 from imitarm.trajectory import Trajectory
@@ -41,9 +46,11 @@ class PlanInExecution:
         adaptation: the plan.
         began: time of its first sample [s].
         offset: time in the learned motion at which the plan begins [s].
-        scene: the obstacles that the plan assumed, at the time ``began``.
-        margins: the margin of each of these obstacles; None for an obstacle without one.
+        scene: the obstacles that the certificate assumes, at the time ``seen``.
+        seen: the time from which the certificate holds [s].
+        margins: the margin of each of these obstacles from this time on; None for an obstacle without one.
         clearance: required clearance [m].
+        certified: certified clearance [m].
         approach: duration of the motion to the first posture of the path [s]; it is part of the plan.
         trajectory: the tool's path of the whole motion, from time 0.
         joints: the joint positions at its samples, shape (n, n_joints) [rad].
@@ -53,8 +60,10 @@ class PlanInExecution:
     began: float
     offset: float
     scene: Scene
+    seen: float
     margins: Sequence[PredictionMargin | None]
     clearance: float
+    certified: float
     approach: float
     trajectory: Trajectory
     joints: Array
@@ -83,7 +92,8 @@ class PlanInExecution:
                 None if path.quaternions is None else np.concatenate([quaternions, path.quaternions]),
             )
             joints = np.concatenate([approach.joints[:-1], joints])
-        return cls(adaptation, began, offset, scene, margins, clearance, lead, path, joints)
+        certified = adaptation.certified_clearance
+        return cls(adaptation, began, offset, scene, began, margins, clearance, certified, lead, path, joints)
 
     @property
     def end(self) -> float:
@@ -177,10 +187,31 @@ class PlanInExecution:
             f"({1e3 * allowed[worst]:.0f} mm allowed)"
         )
 
+    def certified_again(
+        self, arm: ArmModel, scene: Scene, margins: Sequence[PredictionMargin | None], hold: float
+    ) -> PlanInExecution | None:
+        """Return the same plan with a certificate for the obstacles as seen now; None if the rest is not clear of them.
+
+        Args:
+            arm: the arm.
+            scene: the obstacles as seen now; its stamp is now.
+            margins: the margin of each of them from now on; None for an obstacle without one.
+            hold: time after the arrival for which the arm must be clear at the goal [s].
+        """
+        now, times = scene.stamp, self.trajectory.times + self.began
+        later = times > now
+        times = np.concatenate([[now], times[later], [max(self.end, now) + hold]]) - now
+        joints = np.concatenate([self.joints_at(now)[None], self.joints[later], self.joints[-1:]])
+        around = ArmAmongObstacles(arm, scene.obstacles, self.clearance, margins=margins)
+        room = around.clearance_of(ArmPath.of(arm, joints), times).room
+        if room < 0.0:
+            return None
+        return replace(self, scene=scene, seen=now, margins=margins, certified=self.clearance + room)
+
     def _allowed(self, time: float) -> Array:
         """Return the allowed error of each obstacle of the plan at a time [s], shape (n,) [m]."""
-        spare = max(self.adaptation.certified_clearance - self.clearance, 0.0)
-        margins = [0.0 if m is None else float(m.at(np.array(time - self.began))) for m in self.margins]
+        spare = max(self.certified - self.clearance, 0.0)
+        margins = [0.0 if m is None else float(m.at(np.array(time - self.seen))) for m in self.margins]
         return np.array(margins) + (min(spare, 1.0) + _ROUNDING)
 
 
