@@ -88,6 +88,7 @@ def test_points_on_a_convex_surface_are_not_deep_and_two_touching_balls_are_cut_
     assert (depth_in_hull(ball * [1.0, 1.0, 0.0]) == 0.0).all()
     both = np.concatenate([ball, ball + [0.0, 0.2, 0.0]])
     assert concavity(both) > 0.02
+    assert concavity(both) == pytest.approx(np.quantile(depth_in_hull(both), 0.9), rel=1e-12)
     side, score = best_cut(both, np.array([3.0, 0.0, 0.0]))
     assert score < 0.2 * concavity(both)
     assert min(np.mean(side[:400] == side[0]), np.mean(side[400:] != side[0])) > 0.9

