@@ -263,21 +263,17 @@ class ObstacleDetector:
     def _off(self, surface: Obstacle, measured: _Measured, frame: Frame) -> NDArray[np.bool_]:
         """Return which points don't belong to a surface, shape (n,).
 
-        A single point must be three standard deviations above the surface. Less is enough if neighbouring pixels are
-        above it too: the mean of nine has a third of the noise.
+        A point is off the surface if it is three standard deviations above it. In an image, a lower point is off the
+        surface too if five or six of the nine pixels around it are at least one standard deviation above.
         """
         sigma = self.noise.sigma(measured.depth)
-        height = surface.distances_at(measured.points, False)[0]
-        off = height > self.surface_margin + 3.0 * sigma
+        height = surface.distances_at(measured.points, False)[0] - self.surface_margin
+        off = height > 3.0 * sigma
         if measured.pixel is not None and isinstance(frame, DepthFrame):
-            sums, counts = np.zeros(frame.depth.size), np.zeros(frame.depth.size)
-            sums[measured.pixel], counts[measured.pixel] = height, 1.0
-            shape = frame.depth.shape
-            total, count = (uniform_filter(v.reshape(shape), 3, mode="constant").ravel() for v in (sums, counts))
-            mean = total[measured.pixel] / np.maximum(count[measured.pixel], 1e-9)
-            enough = count[measured.pixel] > 6.5 / 9.0
-            low = self.surface_margin + 1.2 * sigma
-            off |= enough & (mean > low) & (height > self.surface_margin)
+            above = np.zeros(frame.depth.shape)
+            above.ravel()[measured.pixel] = height > sigma
+            count = np.rint(9.0 * uniform_filter(above, 3, mode="constant").ravel()[measured.pixel])
+            off |= ((height > sigma) & (count >= 5)) | ((height > 0.0) & (count >= 6))
         return off
 
     def _of_one_color(self, measured: _Measured) -> list[_Measured]:
