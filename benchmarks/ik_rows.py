@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik import IKSolver
 from imitarm.kinematics.limits import JointLimits, singularity_limits
+from imitarm.kinematics.pose import Pose
 from imitarm.kinematics.tasks import ElbowTask, Task, TwistTask
 from imitarm.scene import Scene, Sphere
 from imitarm.scene.clearance import SelfClearance
@@ -155,25 +156,26 @@ def obstacle_rows() -> Row:
     )
 
 
-def avoiding_steps_against_mink() -> Row:
-    """Clearance rows and IK with 5 obstacles, against mink with its collision avoidance of the same shapes."""
-    import mink
-
-    arm = ArmModel.load("sawyer", tool="gripper")
-    limit, solver, scene = ClearanceLimit(arm, _CLEARANCE), IKSolver(arm, dt=DT), obstacles(arm, 5)
-    states = loop_states(solver)
-    target = arm.tool_pose(states[-1].q + 0.01)
+def shaped(arm: ArmModel) -> tuple[mujoco.MjSpec, list[str]]:
+    """Return the arm without what is only drawn, and the names of its shapes."""
     spec = arm.spec()
     for geom in [geom for geom in spec.geoms if not geom.name]:
-        spec.delete(geom)  # what is only drawn
-    links = [geom.name for geom in spec.geoms]
+        spec.delete(geom)
+    return spec, [geom.name for geom in spec.geoms]
+
+
+def avoiding_mink(arm: ArmModel, scene: Scene, states: list[State], target: Pose) -> MinkStep:
+    """Return a step of mink that keeps the arm's own shapes 2 cm away from spheres."""
+    import mink
+
+    spec, links = shaped(arm)
     for i, sphere in enumerate(scene.obstacles):
         assert isinstance(sphere, Sphere)
         spec.worldbody.add_geom(
             name=f"obstacle {i}", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[sphere.radius, 0, 0], pos=sphere.center
         )
     names = [f"obstacle {i}" for i in range(len(scene.obstacles))]
-    peer = MinkStep(
+    return MinkStep(
         arm,
         [state.q for state in states],
         target,
@@ -187,6 +189,15 @@ def avoiding_steps_against_mink() -> Row:
             )
         ],
     )
+
+
+def avoiding_steps_against_mink() -> Row:
+    """Clearance rows and IK with 5 obstacles, against mink with its collision avoidance of the same shapes."""
+    arm = ArmModel.load("sawyer", tool="gripper")
+    limit, solver, scene = ClearanceLimit(arm, _CLEARANCE), IKSolver(arm, dt=DT), obstacles(arm, 5)
+    states = loop_states(solver)
+    target = arm.tool_pose(states[-1].q + 0.01)
+    peer = avoiding_mink(arm, scene, states, target)
     ticks, theirs = cycle(states), cycle(states)
 
     def step() -> Array:

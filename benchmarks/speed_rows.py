@@ -21,6 +21,7 @@ import arm_rows
 import ik_rows
 import rcamo_rows
 import retarget_rows
+import safety_rows
 import tracking_rows
 import transmission_rows
 from imitarm.benchmark import avoidance, families
@@ -320,6 +321,7 @@ ROWS: tuple[Callable[[], Row], ...] = (
     *ik_rows.ROWS,
     *rcamo_rows.ROWS,
     *retarget_rows.ROWS,
+    *safety_rows.ROWS,
     *tracking_rows.ROWS,
     *transmission_rows.ROWS,
     importing,

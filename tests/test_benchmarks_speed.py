@@ -15,6 +15,7 @@ import arm_rows
 import checkouts
 import ik_rows
 import retarget_rows
+import safety_rows
 import speed
 import speed_rows
 import timing
@@ -194,9 +195,8 @@ def test_a_checkout_that_can_not_be_loaded_is_reported(tmp_path: Path) -> None:
 
 def test_every_row_is_run_says_what_it_does_and_has_a_name_of_its_own() -> None:
     rows = speed_rows.ROWS
-    assert {*arm_rows.ROWS, *ik_rows.ROWS, *retarget_rows.ROWS, *tracking_rows.ROWS, *transmission_rows.ROWS} <= set(
-        rows
-    )
+    modules = (arm_rows, ik_rows, retarget_rows, safety_rows, tracking_rows, transmission_rows)
+    assert {row for module in modules for row in module.ROWS} <= set(rows)
     assert all(make.__doc__ for make in rows)
     assert len({make.__name__ for make in rows}) == len(rows)
 

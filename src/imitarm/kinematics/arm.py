@@ -254,7 +254,17 @@ class ArmModel(ArmKinematics):
         Returns:
             centers (m, 3) [m] in the base frame and radii (m,) [m].
         """
-        return self.cover.centers(self.at(q).data), self.cover.radii
+        return self.sphere_centers(q).copy(), self.cover.radii
+
+    def sphere_centers(self, q: ArrayLike) -> Array:
+        """Return the centers of :meth:`collision_spheres`, shape (m, 3) [m]; computed once for each posture.
+
+        The array must not be changed, and is valid until a method is called with another posture.
+        """
+        memory = self.at(q)
+        if memory.centers is None:
+            memory.centers = self.cover.centers(memory.data)
+        return memory.centers
 
     @property
     def tool_spheres(self) -> Array:

@@ -80,6 +80,7 @@ class ArmMemory:
         angular: last three rows of ``jacobian``.
         sites: positions of the sites in the base frame, shape (nsite, 3) [m].
         force: generalised forces, shape (nv,).
+        centers: centres of the spheres that cover the arm, once they have been computed for the posture.
     """
 
     def __init__(
@@ -100,6 +101,7 @@ class ArmMemory:
         self.jacobian = np.zeros((6, model.nv))
         self.linear, self.angular = self.jacobian[:3], self.jacobian[3:]
         self.force = np.zeros(model.nv)
+        self.centers: Array | None = None
         self._model, self._positions, self._joints, self._posture = model, positions, joints, b""
         stacked = np.zeros((len(landmarks), 3, model.nv))
         self._stacked = stacked.reshape(-1, model.nv)
@@ -119,7 +121,7 @@ class ArmMemory:
             self._qpos[self._positions] = q
             mujoco.mj_kinematics(self._model, self.data)
             mujoco.mj_comPos(self._model, self.data)
-            self._posture = posture
+            self._posture, self.centers = posture, None
 
     def site_pose(self, site: int) -> Pose:
         """Return the pose of a site in the base frame."""

@@ -88,7 +88,7 @@ class SelfClearance:
 
     def _centers(self, q: ArrayLike) -> Array:
         """Return the centres of all spheres, with the base's spheres last, shape (m, 3) [m]."""
-        return np.concatenate([self.arm.collision_spheres(q)[0], self.arm.cover.base_centers])
+        return np.concatenate([self.arm.sphere_centers(q), self.arm.cover.base_centers])
 
     @property
     def n_pairs(self) -> int:

@@ -129,8 +129,7 @@ class ClearanceLimit:
         packed = scene.packed
         if not len(packed):
             return None
-        data = self.arm.at(q).data
-        centers = self._cover.centers(data)
+        data, centers = self.arm.at(q).data, self.arm.sphere_centers(q)
         pairs = near_pairs(packed, centers, self._reach(packed, margins))
         if pairs is None:
             return None
