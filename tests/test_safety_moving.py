@@ -85,7 +85,7 @@ def test_the_faster_the_obstacle_and_the_slower_the_link_the_earlier_the_arm_yie
     assert np.all(np.diff(rates, axis=0) <= 0.0) and np.all(rates[1:, 1] <= rates[1:, 0])
     np.testing.assert_array_equal(rates[0], APPROACH_RATE)
     assert shrink_rates(arm, gradients, None) == APPROACH_RATE
-    assert shrink_rates(arm, gradients, None, arm.max_velocity) < APPROACH_RATE  # brakes for a third of a second
+    assert shrink_rates(arm, gradients, None, 4.0 * arm.max_velocity) < APPROACH_RATE
 
 
 def test_an_intervention_names_the_link_and_the_obstacle():

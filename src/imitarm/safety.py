@@ -13,20 +13,20 @@ from numpy.typing import ArrayLike, NDArray
 from imitarm.command import Command
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik import IKSolver
-from imitarm.kinematics.ik_problem import Rows
+from imitarm.kinematics.ik_problem import Box, Rows
 from imitarm.kinematics.least_violation import least_violation
-from imitarm.kinematics.limits import Limit
+from imitarm.kinematics.limits import JointLimits, Limit
 from imitarm.kinematics.tasks import ElbowTask, JointVelocityTask, PostureTask, Task, TwistTask
 from imitarm.perception.margins import CoverageMargin
 from imitarm.scene.clearance import SelfClearance
-from imitarm.scene.clearance_limit import ClearanceLimit, NearRows
+from imitarm.scene.clearance_limit import ClearanceLimit, NearRows, violable
 from imitarm.scene.scene import Scene
 from imitarm.validation import finite_number, finite_vector, instance
 
 Array = NDArray[np.float64]
 
 _KEPT = 1e-6  # [m/s] a row that is missed by less is kept: what rounding leaves
-_ROUNDING = 1e-9  # [m/s]
+_ROUNDING = 1e-9  # [m/s, rad/s]
 
 
 class Cause(NamedTuple):
@@ -142,6 +142,8 @@ class SafetyFilter:
             delay = self.dt + self.latency
             self._obstacles = ClearanceLimit(arm, self.clearance + allowance, delay=delay, deviations=deviations)
         self._own = None if self_clearance is None else SelfClearance(arm, self_clearance)
+        self._accelerates = any(isinstance(limit, JointLimits) for limit in self.solver.limits)
+        self._change = arm.max_acceleration * self.dt + _ROUNDING
 
     def step(self, command: Command, q: ArrayLike, velocity: ArrayLike | None, scene: Scene) -> SafetyStep:
         """Return the joint velocity for one control period.
@@ -181,15 +183,27 @@ class SafetyFilter:
         )
 
     def _near(self, q: Array, velocity: Array | None, scene: Scene) -> tuple[NearRows | None, Rows | None]:
-        """Return the rows of obstacles, and those of the arm's own links."""
-        near = None
+        """Return the rows of obstacles, and those of the arm's own links, that the next velocity could violate."""
+        box = None if velocity is None else self._box(velocity)
+        near = own = None
         if self._obstacles is not None:
             margins = None
             if self.margin is not None:
                 ages = np.maximum(scene.stamp - scene.packed.stamps, 0.0)
                 margins = np.asarray(self.margin.at(ages + self.latency), dtype=float)
-            near = self._obstacles.near(q, scene, velocity, margins)
-        return near, None if self._own is None else self._own.rows(q)
+            near = self._obstacles.near(q, scene, velocity, margins, box)
+        if self._own is not None:
+            own = self._own.rows(q)
+        if own is not None and box is not None and not violable(own.matrix, own.lower, box).any():
+            own = None
+        return near, own
+
+    def _box(self, velocity: Array) -> Box | None:
+        """Return bounds that contain every joint velocity that the acceleration limits allow after ``velocity``."""
+        if not self._accelerates:
+            return None
+        before = np.clip(velocity, -self.arm.max_velocity, self.arm.max_velocity)
+        return Box(before - self._change, before + self._change)
 
     def _admits(self, q: Array, wanted: Array, velocity: Array | None, rows: list[Rows]) -> bool:
         """Return whether a joint velocity already keeps all limits and inequalities."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.ik_problem import Rows
+from imitarm.kinematics.ik_problem import Box, Rows
 from imitarm.scene.braking import APPROACH_RATE, LONGEST_YIELD, shrink_rates
 from imitarm.scene.distances import PackedObstacles, near_pairs
 from imitarm.scene.scene import Scene
@@ -95,6 +95,7 @@ class ClearanceLimit:
         cover = arm.cover
         self._cover = cover
         self._reduced = cover.radii + self.clearance  # [m] what is taken off a distance
+        self._free = Box(-arm.max_velocity, arm.max_velocity)
         self._reaches = {0: self._reduced + self.influence}  # by the speed of the fastest obstacle, in 0.1 m/s
 
     def rows(self, q: ArrayLike, scene: Scene, velocity: ArrayLike | None = None) -> Rows | None:
@@ -116,7 +117,12 @@ class ClearanceLimit:
         return None if found is None else found.rows
 
     def near(
-        self, q: ArrayLike, scene: Scene, velocity: ArrayLike | None = None, margins: Array | None = None
+        self,
+        q: ArrayLike,
+        scene: Scene,
+        velocity: ArrayLike | None = None,
+        margins: Array | None = None,
+        box: Box | None = None,
     ) -> NearRows | None:
         """Return the inequalities and the pairs to which they belong; same arguments and errors as :meth:`rows`.
 
@@ -125,6 +131,8 @@ class ClearanceLimit:
             scene: obstacles predicted for the current time, with their velocities.
             velocity: joint velocity, shape (n_joints,) [rad/s]; None: at rest.
             margins: distance added to the clearance of each obstacle, shape (n_obstacles,) [m]; None: nothing.
+            box: bounds of the joint velocity; rows that no velocity within them violates are left out. None: the
+                velocity limits of the arm.
         """
         packed = scene.packed
         if not len(packed):
@@ -143,15 +151,16 @@ class ClearanceLimit:
             spread = np.einsum("ik,kij,jk->k", normal, packed.covariances.take(obstacle, axis=0), normal)
             room -= self.deviations * np.sqrt(np.maximum(spread, 0.0))
         approach = _approach(packed, obstacle, points, normal)
-        lower = self._lower(scene, matrix, obstacle, room, approach, velocity)
-        return self._kept(matrix, lower, obstacle, sphere, room)
+        speed = None if velocity is None else np.asarray(velocity, dtype=float)
+        return self._rows(
+            scene, matrix, _Pairs(obstacle, sphere, room, approach), speed, self._free if box is None else box
+        )
 
     def _reach(self, packed: PackedObstacles, margins: Array | None) -> Array:
         """Return the distance of each sphere's centre within which obstacles have rows; the same array if possible."""
         if packed.still and margins is None and not self.deviations:
             return self._reaches[0]
-        fastest = math.sqrt(float(np.einsum("ij,ij->i", packed.velocities, packed.velocities).max()))
-        more = 0.5 * LONGEST_YIELD * fastest + (0.0 if margins is None else max(float(margins.max()), 0.0))
+        more = 0.5 * LONGEST_YIELD * packed.fastest + (0.0 if margins is None else max(float(margins.max()), 0.0))
         if self.deviations:
             more += self.deviations * math.sqrt(float(packed.covariances.trace(axis1=1, axis2=2).max()))
         steps = math.ceil(more / _STEP)
@@ -159,40 +168,58 @@ class ClearanceLimit:
             self._reaches[steps] = self._reaches[0] + _STEP * steps
         return self._reaches[steps]
 
-    def _lower(
-        self,
-        scene: Scene,
-        matrix: Array,
-        obstacle: Indices,
-        room: Array,
-        approach: Array | None,
-        velocity: ArrayLike | None,
-    ) -> Array:
-        """Return the lower bounds of the rows, shape (k,) [m/s]."""
-        speed = None if velocity is None else np.asarray(velocity, dtype=float)
-        packed = scene.packed
+    def _rows(self, scene: Scene, matrix: Array, pairs: _Pairs, velocity: Array | None, box: Box) -> NearRows | None:
+        """Return the rows of pairs, without those that no velocity in the box violates."""
         delay: Array | float = self.delay
-        if approach is not None:
-            delay += np.maximum(scene.stamp - packed.stamps, 0.0).take(obstacle)
-        rates = shrink_rates(self.arm, matrix, approach, speed, most=self.rate, delay=delay)
-        lower = -rates * room
-        lower -= (self.retreat_rate - rates) * np.minimum(room, 0.0)
-        if approach is not None:
-            lower += approach
-        return lower
-
-    def _kept(self, matrix: Array, lower: Array, obstacle: Indices, sphere: Indices, room: Array) -> NearRows | None:
-        """Leave out rows that no velocity can violate, and links that are too close and that no joint moves away."""
-        most = np.abs(matrix) @ self.arm.max_velocity
-        kept = lower > -most
-        if lower.max() > 0.0:  # a link that no joint moves away, such as one that turns in place above a table
-            kept &= (lower <= 0.0) | (np.einsum("ij,ij->i", matrix, matrix) > _UNMOVED**2)
-        if not kept.all():
+        if pairs.approach is not None:
+            ages = np.maximum(scene.stamp - scene.packed.stamps, 0.0)
+            kept = violable(matrix, self._lower(pairs, self._slowest(float(ages.max()), velocity)), box)
             if not kept.any():
                 return None
-            matrix, lower = matrix[kept], lower[kept]
-            obstacle, sphere, room = obstacle[kept], sphere[kept], room[kept]
-        return NearRows(Rows(matrix, lower), obstacle, sphere, room)
+            matrix, pairs = matrix[kept], pairs.of(kept)
+            delay += ages.take(pairs.obstacle)
+        rates = shrink_rates(self.arm, matrix, pairs.approach, velocity, most=self.rate, delay=delay)
+        lower = self._lower(pairs, rates)
+        kept = violable(matrix, lower, box)
+        if lower.max() > 0.0:  # a link that no joint moves away, such as one that turns in place above a table
+            kept &= (lower <= 0.0) | (np.einsum("ij,ij->i", matrix, matrix) > _UNMOVED**2)
+        if not kept.any():
+            return None
+        found = pairs.of(kept)
+        return NearRows(Rows(matrix[kept], lower[kept]), found.obstacle, found.sphere, found.room)
+
+    def _slowest(self, age: float, velocity: Array | None) -> float:
+        """Return a lower bound of all rates at which distances may shrink [1/s]."""
+        time = 0.0 if velocity is None else float((np.abs(velocity) / self.arm.max_acceleration).max())
+        return min(self.rate, 1.0 / (self.delay + age + 0.5 * max(time, LONGEST_YIELD)))
+
+    def _lower(self, pairs: _Pairs, rates: Array | float) -> Array:
+        """Return the lower bounds of the rows, shape (k,) [m/s]."""
+        lower = -rates * pairs.room
+        lower -= (self.retreat_rate - rates) * np.minimum(pairs.room, 0.0)
+        if pairs.approach is not None:
+            lower += pairs.approach
+        return lower
+
+
+class _Pairs(NamedTuple):
+    """Pairs of a sphere and an obstacle, each of shape (k,)."""
+
+    obstacle: Indices
+    sphere: Indices
+    room: Array
+    approach: Array | None  # speed of the obstacle along the normal [m/s]; None if no obstacle moves
+
+    def of(self, kept: NDArray[np.bool_]) -> _Pairs:
+        """Return some of the pairs."""
+        approach = None if self.approach is None else self.approach[kept]
+        return _Pairs(self.obstacle[kept], self.sphere[kept], self.room[kept], approach)
+
+
+def violable(matrix: Array, lower: Array, box: Box) -> NDArray[np.bool_]:
+    """Return for each row ``matrix @ v >= lower`` whether any velocity v in a box violates it, shape (k,)."""
+    middle, half = 0.5 * (box.lower + box.upper), 0.5 * (box.upper - box.lower)
+    return np.asarray(lower > matrix.dot(middle) - np.abs(matrix).dot(half))
 
 
 def _approach(packed: PackedObstacles, obstacle: Indices, points: Array, normal: Array) -> Array | None:

@@ -141,7 +141,7 @@ class PackedObstacles:
             stamps=np.full(len(self), stamp),
             covariances=self.covariances if covariances is None else covariances,
         )
-        for name in ("still", "rotating"):
+        for name in ("still", "rotating", "fastest"):
             moved.__dict__.pop(name, None)
         return moved
 
@@ -176,6 +176,11 @@ class PackedObstacles:
     def still(self) -> bool:
         """Whether no obstacle moves."""
         return not (self.velocities.any() or self.angular_velocities.any())
+
+    @cached_property
+    def fastest(self) -> float:
+        """Speed of the fastest obstacle [m/s]; 0 without obstacles."""
+        return math.sqrt(float(np.einsum("ij,ij->i", self.velocities, self.velocities).max(initial=0.0)))
 
     @cached_property
     def rotating(self) -> bool:
