@@ -11,7 +11,7 @@ from imitarm.policies import ACFRA, Stage, StagedPolicy
 from imitarm.safety import SafetyFilter
 from imitarm.scene import Scene, Sphere
 from imitarm.tasks.packing import BOTTLE, BOX, CLOSED, CUBE, OPEN, PackingTask, packing_skills, reach
-from imitarm.tasks.packing_run import run_packing
+from imitarm.tasks.packing_run import Watched, run_packing
 
 ARM = PackingTask.arm()
 
@@ -73,6 +73,19 @@ def test_the_cube_is_packed_while_box_and_bottle_move_as_a_sensor_and_a_tracker_
     assert done.success, done.reason
     assert done.min_clearance > 0.0 and not done.details["contacts"]
     assert done.details["statuses"]["avoiding"] > 0
+
+
+def test_a_camera_sees_the_cube_the_box_and_the_bottle():
+    task = PackingTask(0)
+    robot = task.robot(arm=ARM)
+    watched = Watched(task, robot)
+    assert robot.time == pytest.approx(1.0)
+    scene = watched(0.0)
+    assert sorted({obstacle.name for obstacle in scene.obstacles}) == [BOTTLE, BOX]
+    np.testing.assert_allclose(watched.grasp().position, task.grasp.position, atol=0.012)
+    np.testing.assert_allclose(task.release(scene).position[:2], task.box_at(1.0)[:2], atol=0.02)
+    bottle = next(obstacle for obstacle in scene.obstacles if obstacle.name == BOTTLE)
+    np.testing.assert_allclose(bottle.bounds().mean(axis=0)[:2], task.bottle_at(1.0)[:2], atol=0.03)
 
 
 def test_the_demonstrated_motions_begin_and_end_where_they_should():

@@ -17,7 +17,7 @@ from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_kinematics import find_posture
 from imitarm.kinematics.pose import Pose
 from imitarm.robots.simulated import Control, SimulatedRobot
-from imitarm.robots.world import arm_world
+from imitarm.robots.world import OBSTACLE, arm_world
 from imitarm.scene import Box, Cylinder, HalfSpace, MovingScene, Obstacle, Scene, standard_fixtures
 from imitarm.scene.motion import Motion as Movement
 from imitarm.skills.skill import Skill
@@ -29,6 +29,7 @@ Array = NDArray[np.float64]
 
 OPEN, CLOSED = 0.08, 0.0  # [m] commanded openings of the gripper; the cube stops the closing fingers earlier
 BOX, BOTTLE, CUBE = "packing box", "bottle", "cube"
+BOX_COLOR, BOTTLE_COLOR, CUBE_COLOR = (0.55, 0.38, 0.16), (0.20, 0.42, 0.70), (0.75, 0.12, 0.10)  # red, green, blue
 
 _SIDE = 0.04  # [m] of the cube
 _MASS, _FRICTION = 0.05, [0.6, 0.005, 0.0001]
@@ -75,6 +76,11 @@ class PackingTask:
         return ArmModel.load("sawyer", tool="gripper")
 
     @property
+    def rim(self) -> float:
+        """Height of the rim of the box above the table [m]."""
+        return _THICK + _INSIDE[2]
+
+    @property
     def cube(self) -> Array:
         """Centre of the cube at the start, shape (3,) [m]."""
         place = np.random.default_rng([560, self.seed]).uniform(-_CUBE_OFFSET, _CUBE_OFFSET, 2)
@@ -83,7 +89,16 @@ class PackingTask:
     @property
     def grasp(self) -> Pose:
         """Pose of the tool in which the fingers close on the cube."""
-        return Pose(self.cube, np.array(LOOKING_DOWN))
+        return self.grasp_at(self.cube)
+
+    @staticmethod
+    def grasp_at(cube: Array) -> Pose:
+        """Return the pose of the tool in which the fingers close on a cube on the table.
+
+        Args:
+            cube: centre of the cube, shape (3,) [m]; only x and y are used.
+        """
+        return Pose(np.array([cube[0], cube[1], 0.5 * _SIDE]), np.array(LOOKING_DOWN))
 
     def box_at(self, time: float) -> Array:
         """Return the middle of the box's bottom, on its inside, shape (3,) [m], at a time [s]."""
@@ -101,29 +116,35 @@ class PackingTask:
     def release(self, scene: Scene) -> Pose | None:
         """Return the pose of the tool above the middle of the box that is seen in a scene; None if no box is seen.
 
-        A sensor reports no names, so the box is recognised by its size.
+        The box is recognised by its name, or by its size if the sensor reports no names.
         """
-        best, error = None, _SAME_SIZE
         for obstacle in scene.obstacles:
             low, high = obstacle.bounds()
-            wrong = float(np.abs(high - low - _outer()).max())
-            if wrong < error:
-                best, error = (
-                    Pose(np.array([*(0.5 * (low + high))[:2], high[2] + _RELEASE]), np.array(LOOKING_DOWN)),
-                    wrong,
-                )
-        return best
+            if obstacle.name == BOX or np.abs(high - low - self.outer).max() < _SAME_SIZE:
+                middle = 0.5 * (low + high)
+                return Pose(np.array([*middle[:2], self.rim + _RELEASE]), np.array(LOOKING_DOWN))
+        return None
 
     def truth(self) -> MovingScene:
         """Return what a sensor can see: the box as one solid, and the bottle, as they really move."""
         return MovingScene(
-            Scene(None, (self._solid_box(0.0), self._bottle()), fixtures=_fixtures()),
+            Scene(None, (self._solid_box(0.0), self._bottle()), fixtures=packing_fixtures()),
             {BOX: lambda t: self._solid_box(t).pose.position, BOTTLE: self.bottle_at},
         )
 
+    @property
+    def outer(self) -> Array:
+        """Outer size of the box, shape (3,) [m]."""
+        x, y, z = _INSIDE
+        return np.array([x + 2.0 * _THICK, y + 2.0 * _THICK, z + _THICK])
+
+    def box_around(self, middle: Array) -> Box:
+        """Return the box as one solid on the table, around a place (2,) [m]."""
+        center = np.array([*middle, 0.5 * self.rim])
+        return Box(Pose(center, np.array([1.0, 0.0, 0.0, 0.0])), self.outer, name=BOX)
+
     def _solid_box(self, time: float) -> Box:
-        middle = self.box_at(time) + np.array([0.0, 0.0, 0.5 * (_INSIDE[2] - _THICK)])
-        return Box(Pose(middle, np.array([1.0, 0.0, 0.0, 0.0])), _outer(), name=BOX)
+        return self.box_around(self.box_at(time)[:2])
 
     def _bottle(self) -> Cylinder:
         pose = Pose(self.bottle_at(0.0), np.array([1.0, 0.0, 0.0, 0.0]))
@@ -143,12 +164,14 @@ class PackingTask:
         motions |= {board.name: self._along_with_box(board) for board in boards}
         robot = SimulatedRobot(
             arm,
-            scene=Scene(None, obstacles, fixtures=_fixtures()),
+            scene=Scene(None, obstacles, fixtures=packing_fixtures()),
             motion=motions,
             world=self._world(arm),
             control=control,
             q=start_posture(arm),
         )
+        for i, color in enumerate([BOX_COLOR] * len(boards) + [BOTTLE_COLOR]):
+            robot.model.geom(f"{OBSTACLE}{i}").rgba = (*color, 1.0)
         robot.grasp(OPEN)
         return robot
 
@@ -158,7 +181,7 @@ class PackingTask:
 
     def _world(self, arm: ArmModel) -> mujoco.MjSpec:
         """Return the world without obstacles: arm, table and cube."""
-        spec = arm_world(arm, fixtures=_fixtures())
+        spec = arm_world(arm, fixtures=packing_fixtures())
         spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10.0  # so that the cube does not slip
         (x, y), size = _TABLE
         half = 0.5 * np.array(size)
@@ -168,8 +191,7 @@ class PackingTask:
         table.add_geom(name="table top", type=shape, size=half, rgba=(0.80, 0.68, 0.52, 1.0), **surface)
         body = spec.worldbody.add_body(name=CUBE, pos=self.cube)
         body.add_freejoint(name=CUBE)
-        red = (0.75, 0.18, 0.16, 1.0)
-        body.add_geom(name=CUBE, type=shape, size=[0.5 * _SIDE] * 3, mass=_MASS, rgba=red, **surface)
+        body.add_geom(name=CUBE, type=shape, size=[0.5 * _SIDE] * 3, mass=_MASS, rgba=(*CUBE_COLOR, 1.0), **surface)
         return spec
 
     def evaluate(self, robot: SimulatedRobot, rollout: Rollout) -> Rollout:
@@ -188,13 +210,8 @@ def start_posture(arm: ArmModel) -> Array:
     return find_posture(arm, PackingTask.start)
 
 
-def _outer() -> Array:
-    """Return the outer size of the box, shape (3,) [m]."""
-    x, y, z = _INSIDE
-    return np.array([x + 2.0 * _THICK, y + 2.0 * _THICK, z + _THICK])
-
-
-def _fixtures() -> tuple[Obstacle, ...]:
+def packing_fixtures() -> tuple[Obstacle, ...]:
+    """Return the table, the floor and the pedestal."""
     return (HalfSpace(np.zeros(3), name="table"), *standard_fixtures())
 
 

@@ -3,32 +3,73 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from imitarm.control_loop.camera_observer import CameraObserver
 from imitarm.control_loop.observer import SensorModel, TrackedScene
 from imitarm.control_loop.reproduce import Step, reproduce
 from imitarm.kinematics.arm import ArmModel
-from imitarm.perception import ObstacleTracker
+from imitarm.kinematics.pose import Pose, matrix_to_quaternion
+from imitarm.perception import (
+    DepthFrame,
+    DepthNoise,
+    Detection,
+    Intrinsics,
+    ObstacleDetector,
+    ObstacleTracker,
+    PointCloud,
+    Target,
+)
 from imitarm.policies import Stage, StagedPolicy
 from imitarm.policies.rcamo import RCAMO
+from imitarm.robots.depth_camera import DepthCamera
 from imitarm.robots.simulated import SimulatedRobot
 from imitarm.safety import SafetyFilter
 from imitarm.scene import Scene
-from imitarm.tasks.packing import CLOSED, OPEN, PackingTask, packing_skills
+from imitarm.tasks.packing import (
+    BOTTLE,
+    BOTTLE_COLOR,
+    BOX,
+    BOX_COLOR,
+    CLOSED,
+    CUBE,
+    CUBE_COLOR,
+    OPEN,
+    PackingTask,
+    packing_fixtures,
+    packing_skills,
+)
 from imitarm.trajectory import Rollout
 
+Array = NDArray[np.float64]
 Observer = Callable[[PackingTask, SimulatedRobot], Callable[[float], Scene]]
 DT = 0.01  # [s] control period
 _NEAR_CUBE, _NEAR_BOX = 0.004, 0.015  # [m] from the goal: the gripper closes on the cube, opens above the box
 _FINGERS = 1.0  # [s] in which the fingers close or open
+_PIXELS, _FIELD_OF_VIEW = (200, 150), 0.9  # columns and rows, vertical [rad]
+_EYE, _MIDDLE = (
+    np.array([1.45, -0.05, 0.95]),
+    np.array([0.56, -0.02, 0.05]),
+)  # [m] place of the camera, what it looks at
+_WORKSPACE = ((0.30, -0.60, 0.0), (1.0, 0.60, 0.6))  # [m]
+_WATCHES = 1.0  # [s] before the arm moves
+_RIM, _FEWEST, _WRONG = 0.03, 30, 0.06  # [m] height of points of the rim, their least number, [m] error of its size
+_BOX_SIGMA = 0.006  # [m] standard deviation of the middle of the rim
+_ON_TABLE = 0.03  # [m] height of the underside of a cube that is not in the gripper
 _LINKS = 0.005  # [m] clearance that the safety filter keeps; the gripper itself works near the box
 
 
-def packing_policy(task: PackingTask, arm: ArmModel) -> StagedPolicy:
+def packing_policy(task: PackingTask, arm: ArmModel, grasp: Callable[[], Pose]) -> StagedPolicy:
     """Return the policy of the task: reach the cube, close the gripper, follow the box with the cube, and release it.
 
     Args:
         task: the task.
         arm: the arm with the gripper.
+        grasp: function that returns the pose of the tool in which the fingers close on the cube, as far as it is known.
     """
     reach, carry = packing_skills()
     spheres = arm.tool_spheres
@@ -37,7 +78,7 @@ def packing_policy(task: PackingTask, arm: ArmModel) -> StagedPolicy:
             Stage(
                 "reach",
                 RCAMO(reach, tool_spheres=spheres, clearance=task.clearance, arrival=_NEAR_CUBE),
-                goal=lambda scene: task.grasp,
+                goal=lambda scene: grasp(),
                 opening=CLOSED,
                 hold=_FINGERS,
             ),
@@ -74,7 +115,8 @@ def run_packing(
     robot = task.robot(arm=arm)
     observe = (sensed if observer is None else observer)(task, robot)
     safety = SafetyFilter(robot.arm, dt=DT, clearance=_LINKS)
-    policy = packing_policy(task, robot.arm)
+    grasp = observe.grasp if isinstance(observe, Watched) else lambda: task.grasp
+    policy = packing_policy(task, robot.arm, grasp)
     done = reproduce(policy, robot, observe, dt=DT, timeout=task.timeout, safety=safety, on_step=on_step)
     return task.evaluate(robot, done)
 
@@ -91,5 +133,101 @@ def exact(task: PackingTask, robot: SimulatedRobot) -> Callable[[float], Scene]:
     return task.truth().at
 
 
-OBSERVERS: dict[str, Observer] = {"exact": exact, "sensor": sensed}
+class PackingDetector(ObstacleDetector):
+    """Finds cube, bottle and box by their colours; the box has a known size, and is found by its rim.
+
+    An open box is not convex, so no convex shape fits what a camera sees of it. The rim is visible from above on all
+    four sides. Its middle is the middle of the box.
+
+    Args:
+        task: the task.
+        options: arguments of :class:`~imitarm.perception.ObstacleDetector`.
+    """
+
+    def __init__(self, task: PackingTask, arm: ArmModel, **options: Any) -> None:
+        colors = {CUBE: CUBE_COLOR, BOX: BOX_COLOR, BOTTLE: BOTTLE_COLOR}
+        targets = {name: Target(name, np.array(color)) for name, color in colors.items()}
+        super().__init__(arm, targets=list(targets.values()), **options)
+        self._task, self._box = task, targets[BOX]
+
+    def detect(self, frame: DepthFrame | PointCloud, q: ArrayLike | None = None) -> list[Detection]:
+        """Return the cube, the bottle and the box in one image."""
+        found = [detection for detection in super().detect(frame, q) if detection.label != BOX]
+        if isinstance(frame, DepthFrame) and frame.color is not None:
+            points = frame.points()
+            points = points[self._box.has_color(frame.color[~np.isnan(frame.depth)])]
+            rim = points[np.abs(points[:, 2] - self._task.rim) < _RIM]
+            if len(rim) >= _FEWEST:
+                low, high = np.percentile(rim[:, :2], [2.0, 98.0], axis=0)
+                size = self._task.outer[:2] - (high - low)
+                if np.abs(size).max() < _WRONG:  # otherwise, a part of the rim is hidden
+                    box = self._task.box_around(0.5 * (low + high))
+                    found.append(Detection(box, _BOX_SIGMA**2 * np.eye(3), BOX))
+        return found
+
+
+class Watched:
+    """What a depth camera with colours sees of the task; callable as ``observe(t)``.
+
+    The camera stands in front of the table. Before the arm moves, it watches for one second, which the robot waits. The
+    cube is recognised by its colour. It is no obstacle, because the gripper must reach it; its last place is kept
+    while the gripper hides it.
+
+    Args:
+        task: the task.
+        robot: the simulated robot, at rest.
+    """
+
+    def __init__(self, task: PackingTask, robot: SimulatedRobot) -> None:
+        camera = DepthCamera(
+            robot,
+            Intrinsics.from_field_of_view(*_PIXELS, _FIELD_OF_VIEW),
+            _looking_at(_EYE, _MIDDLE),
+            nearest=0.5,
+            farthest=5.0,
+            noise=DepthNoise(),
+            seed=task.seed,
+            color=True,
+        )
+        detector = PackingDetector(
+            task,
+            robot.arm,
+            surfaces=packing_fixtures(),
+            workspace=_WORKSPACE,
+            split=False,
+        )
+        start = robot.time + _WATCHES
+        self._observe = CameraObserver(
+            camera.frame, detector, ObstacleTracker(), joints=lambda: robot.state().q, clock=start
+        )
+        self._task, self._cube = task, task.grasp_at(np.array([*_MIDDLE[:2], 0.0]))
+        while robot.time < start - 0.5 * DT:
+            self(robot.time - start)
+            robot.move(np.zeros(robot.arm.n_joints), DT)
+
+    def __call__(self, time: float) -> Scene:
+        """Return box and bottle as the camera and the tracker know them."""
+        scene = self._observe(time)
+        others = []
+        for obstacle in scene.obstacles:
+            if obstacle.name != CUBE:
+                others.append(obstacle)
+            elif (low := obstacle.bounds()[0])[2] < _ON_TABLE:  # not in the gripper
+                self._cube = self._task.grasp_at(0.5 * (low + obstacle.bounds()[1]))
+        return replace(scene, obstacles=tuple(others))
+
+    def grasp(self) -> Pose:
+        """Return the pose of the tool in which the fingers close on the cube where it was last seen on the table."""
+        return self._cube
+
+
+def _looking_at(eye: Array, target: Array) -> Pose:
+    """Return the pose of a camera whose z axis points from ``eye`` to ``target`` and whose y axis points down."""
+    z = (target - eye) / np.linalg.norm(target - eye)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    return Pose(eye, matrix_to_quaternion(np.column_stack([x, np.cross(z, x), z])))
+
+
+OBSERVERS: dict[str, Observer] = {"exact": exact, "sensor": sensed, "camera": Watched}
 """Ways to observe box and bottle, by name."""
