@@ -27,12 +27,13 @@ def sweep(tmp_path_factory):
 def test_the_demo_does_the_main_job(tmp_path, capsys):
     assert main(["demo", "--out", str(tmp_path / "out")]) == 0
     out = capsys.readouterr().out
-    assert "no contact in 5 of 5 scenes with obstacles" in out
+    assert "no contact in 6 of 6 scenes with obstacles" in out
     results = json.loads((tmp_path / "out" / "results.json").read_text())
-    assert results["passed"] and len(results["scenes"]) == 6
-    moving = results["scenes"][-1]
-    assert moving["name"] == "pushed_box" and moving["success"] and moving["min_clearance_m"] > 0.015
-    for scene in results["scenes"][1:-1]:
+    assert results["passed"] and len(results["scenes"]) == 7
+    *standing, one, two = results["scenes"][1:]
+    for scene, name in ((one, "pushed_box"), (two, "pushed_box_and_bottle")):
+        assert scene["name"] == name and scene["success"] and scene["min_clearance_m"] > 0.015
+    for scene in standing:
         assert scene["success"] and scene["min_clearance_m"] > 0.015 and scene["certified_clearance_m"] >= 0.02
         assert scene["n_moved_components"] < scene["n_components"]
         assert scene["details"]["dirt in the pan"] == "100 %"

@@ -33,8 +33,8 @@ examples:
 
 The package contains eight demonstrations of a sweep, in which a synthetic teacher guides the simulated Sawyer by hand.
 The command checks and aligns the demonstrations, and learns a skill from them.
-The command then reproduces the skill without obstacles, in four scenes with standing obstacles and in one with a moving
-obstacle, or in the scenes of --scenes.
+The command then reproduces the skill without obstacles, in four scenes with standing obstacles and in two with
+moving obstacles, or in the scenes of --scenes.
 Moving obstacles are observed with a simulated sensor (noise of 5 mm, 30 Hz, 33 ms late) and a tracker.
 T1 to T8 are eight scenes with two to four obstacles, modelled on the eight tasks of the thesis (Table 4.1).
 The command writes skill.json, report.html (opens offline in any browser) and results.json to FOLDER.
@@ -42,8 +42,12 @@ The command replaces existing files only with --force.
 The exit status is 1 if a scene fails or the arm touches an obstacle.
 """
 
-DEMO_SCENES = ("free", "two_boxes", "tall_and_low", "boxes_and_cone", "cone_first", "pushed_box")
+DEMO_SCENES = ("free", "two_boxes", "tall_and_low", "boxes_and_cone", "cone_first", *MOVING_SCENES)
 
+GENTLE = {
+    "time_constant": 1.5,
+    "max_acceleration": 9.0,
+}  # a faster push would tilt the brush until it touches the table
 LINKS = 0.01  # [m] clearance that the safety filter keeps from moving obstacles
 
 _SUMMARY = (
@@ -156,7 +160,12 @@ def _sweep(
         moving = task.moving_scene(name)
         robot = task.robot(moving)
         policy = RCAMO(
-            skill, tool_spheres=[[0.0, 0.0, 0.0, task.tool_radius]], clearance=task.clearance, forbidden=HORIZONTAL_ONLY
+            skill,
+            tool_spheres=[[0.0, 0.0, 0.0, task.tool_radius]],
+            clearance=task.clearance,
+            forbidden=HORIZONTAL_ONLY,
+            time_constant=_TIME_CONSTANT,
+            max_acceleration=_MAX_ACCELERATION,
         )
         observe: TrackedScene | None = TrackedScene(moving, SensorModel(seed=task.seed), ObstacleTracker())
     else:
