@@ -44,10 +44,8 @@ The exit status is 1 if a scene fails or the arm touches an obstacle.
 
 DEMO_SCENES = ("free", "two_boxes", "tall_and_low", "boxes_and_cone", "cone_first", *MOVING_SCENES)
 
-GENTLE = {
-    "time_constant": 1.5,
-    "max_acceleration": 9.0,
-}  # a faster push would tilt the brush until it touches the table
+# [s], [m/s^2] of RCAMO: a faster push would tilt the brush until it touches the table
+_TIME_CONSTANT, _MAX_ACCELERATION = 1.5, 9.0
 LINKS = 0.01  # [m] clearance that the safety filter keeps from moving obstacles
 
 _SUMMARY = (
