@@ -5,14 +5,17 @@ import dataclasses
 import numpy as np
 import pytest
 
+from imitarm import SimulatedRobot, find_posture, reproduce
 from imitarm.command import Status
+from imitarm.demonstrations import align, read
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmState
 from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_multiply
 from imitarm.perception import CoverageMargin
 from imitarm.policies import HORIZONTAL_ONLY, NOT_DOWN, POLICIES, RCAMO, DistanceCost, Observation
-from imitarm.scene import Box, HalfSpace, Scene, Sphere
+from imitarm.scene import Box, HalfSpace, MovingScene, Scene, Sphere
 from imitarm.skills import Skill
+from imitarm.tasks import DEMONSTRATIONS, SweepTask
 from imitarm.trajectory import Demonstration, Trajectory
 from skill_samples import shown
 
@@ -203,12 +206,10 @@ def test_forbidden_directions_are_kept(skill):
     scene = Scene(obstacles=[ball])
     for forbidden, kept in ((HORIZONTAL_ONLY, np.abs), (NOT_DOWN, np.negative)):
         policy = RCAMO(skill, tool_spheres=[[0.0, 0.0, 0.0, TOOL]], forbidden=forbidden)
-        path, _, finished = follow(policy, lambda t: scene, skill.start_.position)
-        nominal = follow(RCAMO(skill), lambda t: Scene(), skill.start_.position)[0]
-        n = min(len(path), len(nominal))
+        path, commands, finished = follow(policy, lambda t: scene, skill.start_.position)
+        learned = np.array([policy._path.position(command.progress) for command in commands])
         assert finished and gap(path, ball).min() > 0.0
-        if forbidden is HORIZONTAL_ONLY:
-            assert kept(path[:n, 2] - nominal[:n, 2]).max() < 1e-3
+        assert kept(path[1:, 2] - learned[:, 2]).max() < 1e-3
 
 
 # ----- waiting, the goal, the tool
@@ -224,7 +225,7 @@ def test_it_waits_for_an_obstacle_that_it_cannot_pass_and_goes_on_when_it_leaves
     )
     assert finished and wall.signed_distance(path[:500]).min() - TOOL > 0.0
     waiting = [c for c in commands[:500] if c.status is Status.WAITING]
-    assert len(waiting) > 200 and 'box "gate"' in waiting[-1].reason and "waits" in waiting[-1].reason
+    assert len(waiting) > 100 and 'box "gate"' in waiting[-1].reason and "waits" in waiting[-1].reason
 
 
 def test_an_obstacle_on_the_goal_keeps_it_from_finishing_and_one_beside_the_goal_does_not(skill):
@@ -286,3 +287,16 @@ def test_invalid_options_are_refused(skill):
     with pytest.raises(InputError, match="half-space"):
         policy = RCAMO(skill, cost="gaussian")
         follow(policy, lambda t: Scene(obstacles=[HalfSpace([0, 0, 0], [0, 0, 1])]), skill.start_.position)
+
+
+def test_a_simulated_arm_evades_an_obstacle_on_its_path():
+    skill = Skill(12).fit(align(read(DEMONSTRATIONS)))
+    task = SweepTask()
+    arm = task.arm()
+    here = skill.nominal([0.6 * skill.duration_, skill.duration_]).positions[0]
+    scene = Scene(None, [Sphere(here + [0.0, 0.0, 0.02], 0.025, name="ball")])
+    robot = SimulatedRobot(arm, scene=scene, world=task.world(arm), q=find_posture(arm, task.start))
+    policy = RCAMO(skill, tool_spheres=arm.tool_spheres, forbidden=HORIZONTAL_ONLY, arm=arm)
+    done = reproduce(policy, robot, MovingScene(scene).at, timeout=2.0 * skill.duration_)
+    assert done.success, done.reason
+    assert done.min_clearance > 0.02 and done.details["statuses"]["avoiding"] > 50

@@ -57,7 +57,8 @@ class RCAMO(Policy):
     In every step, all candidates for ``u`` and for the speed ``r`` of the phase are rolled out over a horizon, with the
     obstacles predicted at the velocities that the scene reports, and the candidate of least cost is taken (thesis Eq
     5.5, corrected; see :class:`~imitarm.policies.least_cost.LeastCost`). To wait and to go back are candidates too.
-    Without an obstacle near, ``u = 0``, and the spring brings the tool back to its path.
+    Without an obstacle near, ``u = 0``, and the spring brings the tool back to its path. The phase stops
+    for a robot that lags.
 
     The policy keeps the tool clear. The links are kept clear by the :class:`~imitarm.safety.SafetyFilter`. The policy
     decides step by step, so it can't promise to arrive, and does not refuse.
@@ -91,8 +92,8 @@ class RCAMO(Policy):
         margin: CoverageMargin | None = None,
         beta: float = 1.0,
         cap: float = 0.01,
-        time_constant: float = 1.5,
-        max_acceleration: float = 20.0,
+        time_constant: float = 2.0,
+        max_acceleration: float = 10.0,
         horizon: int = 12,
         interval: float = 0.05,
         gain: float = 8.0,
