@@ -328,7 +328,7 @@ class RCAMO(Policy):
             reason = f"the tool is {1e3 * lag:.0f} mm behind its motion"
             return Command(twist, progress=self._phase, status=Status.WAITING, reason=reason)
         if self._phase >= 1.0 and deviation > self._arrival and chosen.scaled.any():
-            reason = f"the goal is not free because of {self._reason}"
+            reason = f"the way to the goal is not free because of {self._reason}"
             return Command(twist, progress=self._phase, status=Status.WAITING, reason=reason)
         if self._reason and (deviation > _DISPLACED or chosen.rate < 1.0):
             reason = f"the tool is {1e3 * deviation:.0f} mm from its path because of {self._reason}"
