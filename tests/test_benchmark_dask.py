@@ -14,8 +14,7 @@ import pytest
 from distributed import Client
 
 from imitarm.benchmark.running import DASK, Store, Workers, run_experiments
-from imitarm.benchmark.static import StaticExperiment, run_experiment
-from imitarm.benchmark.static_results import ResultLines
+from imitarm.benchmark.static import ResultLines, StaticExperiment, run_experiment
 from imitarm.errors import InputError, TaskFailedError
 
 pytestmark = [

@@ -14,11 +14,17 @@ import pytest
 
 from imitarm.benchmark import static_measures
 from imitarm.benchmark.controls import AimsAtObstacle, NoAvoidance, middle
+from imitarm.benchmark.result_lines import SUFFIX
 from imitarm.benchmark.running import Workers, run_experiments
 from imitarm.benchmark.static import (
+    ResultLines,
     StaticExperiment,
     build,
+    json_line,
     method_names,
+    read_folders,
+    read_lines,
+    result_of,
     run_experiment,
     torques_on_sawyer,
 )
@@ -32,7 +38,6 @@ from imitarm.benchmark.static_measures import (
     measure,
     outcome,
 )
-from imitarm.benchmark.static_results import SUFFIX, ResultLines, json_line, read_folders, read_lines, result_of
 from imitarm.benchmark.static_scenes import FAMILIES, SPLITS, static_case
 from imitarm.errors import InfeasibleError, InputError, UnknownNameError
 from imitarm.kinematics.pose import Pose
@@ -358,7 +363,7 @@ def test_a_run_that_is_killed_again_and_again_loses_nothing(tmp_path):
         "import sys\n"
         "from imitarm.benchmark.running import Workers, run_experiments\n"
         "from imitarm.benchmark.static import StaticExperiment, run_experiment\n"
-        "from imitarm.benchmark.static_results import ResultLines\n"
+        "from imitarm.benchmark.static import ResultLines\n"
         "if __name__ == '__main__':\n"
         "    wanted = [StaticExperiment('S1', 2, s, 'acfra') for s in range(1000, 1150)]\n"
         "    run_experiments(wanted, run_experiment, ResultLines(sys.argv[1]), Workers(2))\n"

@@ -12,10 +12,9 @@ from scipy.stats import binomtest, wilcoxon
 from imitarm import cli
 from imitarm.benchmark import static_tuning
 from imitarm.benchmark.running import Workers
-from imitarm.benchmark.static import StaticExperiment, StaticResult, policy_class
+from imitarm.benchmark.static import ResultLines, StaticExperiment, StaticResult, json_line, policy_class, read_lines
 from imitarm.benchmark.static_claims import claims_table, cost_law, static_tables
 from imitarm.benchmark.static_comparison import PRINTED, mcnemar, pairing, pairings, printed_table, signed_rank, task_of
-from imitarm.benchmark.static_results import ResultLines, json_line, read_lines
 from imitarm.benchmark.static_scaling import Plan, exponent, plan_once, scaling_case
 from imitarm.benchmark.static_tables import (
     StaticResults,

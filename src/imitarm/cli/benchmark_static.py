@@ -13,9 +13,16 @@ from typing import Any
 from imitarm.benchmark.experiment import plain, write_text
 from imitarm.benchmark.provenance import code_version, origin
 from imitarm.benchmark.running import run_experiments
-from imitarm.benchmark.static import StaticExperiment, StaticResult, method_names, policy_class, run_experiment
+from imitarm.benchmark.static import (
+    ResultLines,
+    StaticExperiment,
+    StaticResult,
+    method_names,
+    policy_class,
+    read_folders,
+    run_experiment,
+)
 from imitarm.benchmark.static_claims import cost_law, static_tables
-from imitarm.benchmark.static_results import ResultLines, read_folders
 from imitarm.benchmark.static_scaling import scaling_tables
 from imitarm.benchmark.static_scenes import FAMILIES, SPLITS
 from imitarm.benchmark.static_tables import ORACLE, OURS, StaticResults, checked_refusals_table, success_table
