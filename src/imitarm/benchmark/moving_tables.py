@@ -347,7 +347,7 @@ def tracking_table(results: MovingResults) -> Table:
 
 
 def causes_table(results: MovingResults) -> Table:
-    """Return how many contacts of each method have which cause."""
+    """Return the number of contacts of each method, by cause."""
     causes = sorted({c["cause"] for r in results.all for c in r.values.get("contacts", ())})
     rows = []
     for row in results.rows:

@@ -229,7 +229,7 @@ class Cells:
     Attributes:
         low: lowest coordinates, shape (n, d) [m].
         high: highest coordinates, shape (n, d) [m].
-        level: level of the interval, which is the 2^level-th part of the leg, shape (n,).
+        level: level of the interval, shape (n,); an interval of this level is as long as the leg divided by 2^level.
         at: number of the interval on its level, shape (n,).
         depth: number of divisions from which the cell results, shape (n,).
         free: whether the cell is certainly free, shape (n,).

@@ -371,7 +371,7 @@ class CertifiedRCAMO(Policy):
             )
         twist = self._arm.jacobian(observation.state.q) @ velocity
         stands = float(np.abs(observation.state.velocity).max()) < _STANDS
-        reason = f"no certified plan since {self._since:.1f} s: {self._reason}"
+        reason = f"no certified plan since the time {self._since:.1f} s: {self._reason}"
         status = Status.WAITING if stands else Status.BRAKING
         progress = min(self._learned / self.skill.duration_, 1.0)
         return Command(twist, velocity, progress=progress, status=status, reason=reason)

@@ -113,7 +113,7 @@ class AllowedDirections:
         return np.asarray(reduced @ self.axes.T)
 
     def projected(self, vectors: Array) -> Array:
-        """Return vectors (..., 3) without their parts along the axes on which components can't move."""
+        """Return vectors (..., 3) without their parts along those axes on which the path may not be displaced."""
         return vectors @ self.axes @ self.axes.T
 
     def unit_directions(self, candidates: Array) -> Array:

@@ -61,7 +61,8 @@ class RCAMO(Policy):
     for a robot that lags.
 
     The policy keeps the tool clear. The links are kept clear by the :class:`~imitarm.safety.SafetyFilter`. The policy
-    decides step by step, so it can't promise to arrive, and does not refuse.
+    decides step by step. It therefore can't know in advance whether the motion will arrive, and never raises
+    InfeasibleError.
 
     Args:
         skill: skill to reproduce.

@@ -48,8 +48,8 @@ class ClearanceLimit:
 
     .. math:: n^T J(q)\, \dot q \;\ge\; n^T v_o - k h, \qquad k = \min\Big(\xi,\; \frac1{T + t/2}\Big)
 
-    The row lets h shrink at most exponentially, and only so fast that the arm can still brake, or yield to the
-    obstacle, before h is used up: t is the time that the joints need for this, and T the delay of the commands
+    The row lets h shrink at most exponentially, and so slowly that the arm can still brake or yield to the obstacle
+    before h is 0. Here, t is the time that braking or yielding takes, and T is the delay of the commands
     (:func:`~imitarm.scene.braking.shrink_rates`). For obstacles at rest, k is nearly always :math:`\xi`. Before a fast
     obstacle, and for links that the joints accelerate only slowly, k is smaller, so the arm yields earlier. In theory h
     stays positive. In practice h can become negative, because links move on arcs and control steps are finite. While h
