@@ -411,7 +411,8 @@ def _limbs(view: _View) -> Iterator[RecordingIssue]:
             message = f"the {name} is {length:.2f} m long"
             yield view.issue("error", "limb-length", message, f"positions must be in metres; {remedy}")
         elif deviation > _SPREAD * length and len(tracked) >= _FEW:
-            message = f"the {name}'s length varies by {100 * deviation / length:.0f} % around its mean of {100 * length:.0f} cm"
+            spread = f"{100 * deviation / length:.0f} % around its median of {100 * length:.0f} cm"
+            message = f"the {name}'s length varies by {spread}"
             yield view.issue("warning", "limb-length", message, "record with more light, or face the sensor")
 
 
