@@ -50,7 +50,7 @@ def default_methods(world: str = "tool") -> tuple[str, ...]:
 
 
 def build(method: str, case: MovingCase, options: Options = (), world: str = "tool") -> Policy:
-    """Return a method for a scene, with options that replace its defaults; with an arm, it may also plan the joints.
+    """Return the policy of a method for a scene; in a world with an arm, the policy may also plan the joints.
 
     Raises:
         UnknownNameError: when there is no such method.

@@ -90,7 +90,7 @@ class ArmPath:
         return jacobians
 
     def speeds(self, velocity: Array) -> Array:
-        """Return bounds of the speeds of all spheres of each link, in the frames of the links before it.
+        """Return an upper bound of the speeds of a link's spheres, relative to each earlier link of the arm.
 
         Args:
             velocity: joint velocities, shape (n, n_joints) [rad/s].

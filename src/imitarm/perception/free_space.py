@@ -18,8 +18,9 @@ class FreeSpace:
     """The space that a camera has seen to be empty.
 
     A point is seen to be empty if the ray of its pixel ends behind it. A point behind a surface, outside of the image,
-    or in a pixel that measured nothing is hidden: an obstacle may be there. Only in the middle of an area in which
-    nothing was measured, the space counts as empty, because the surface behind it is out of the camera's range.
+    or in a pixel that measured nothing is hidden: an obstacle may be there. There is one exception: a pixel in
+    the middle of an area in which nothing was measured. Its ray counts as empty, because the surface behind this area
+    is out of the camera's range.
     Points inside the known surfaces, such as a table, belong to no obstacle and count as empty.
 
     Args:

@@ -175,8 +175,9 @@ class ArmAmongObstacles:
     def clearance_of(self, path: ArmPath, times: Array) -> ArmClearance:
         """Bound the clearance on a whole joint path, on which the joints move linearly between the samples.
 
-        A pair that has at least the room f and g at the ends of a segment, and whose distance changes by at most T on
-        it, has at least the room (f + g - T) / 2 on the segment. Most pairs therefore need no tangents.
+        Let f and g be lower bounds of the room of a pair at the two ends of a segment, and let its distance change by
+        at most T along the segment. Its room is then at least (f + g - T) / 2 everywhere on the segment. Most pairs
+        therefore need no tangents.
 
         Args:
             path: the arm at n samples.

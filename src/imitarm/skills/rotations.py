@@ -265,7 +265,9 @@ class QuaternionDMP:
             )
         ends = np.all(t[: _DEGREE + 1] == 0.0) and np.all(t[-_DEGREE - 1 :] == 1.0)
         if not (ends and np.all(np.diff(t) >= 0.0)):
-            raise InputError("QuaternionDMP.from_spline: knots must run from 0 to 1, four times at each end")
+            raise InputError(
+                "QuaternionDMP.from_spline: knots must increase from 0 to 1, and contain 0 and 1 four times each"
+            )
         dmp = cls(gains)
         dmp._take(t, c)
         if np.linalg.norm(dmp._spline(np.linspace(0.0, 1.0, 20 * len(c))), axis=1).min() < 0.5:

@@ -34,7 +34,7 @@ class NearObstacles(NamedTuple):
         gap: distance of the tool to each obstacle, minus the required clearance, shape (n,) [m].
         normal: outward normals, shape (n, d); shorter than 1 if part of a normal lies in a forbidden direction.
         velocity: velocity of each obstacle at its closest point, shape (n, d) [m/s].
-        drift: speed along each normal that the tool has in forbidden directions, shape (n,) [m/s].
+        drift: the part of the tool's velocity in forbidden directions, projected on each normal, shape (n,) [m/s].
         outward: vectors from the centres of the obstacles to the tool, shape (n, d) [m]; the normal for a half-space.
         size: radius of a sphere that contains the obstacle, plus the tool's radius and the clearance, shape (n,) [m].
     """

@@ -72,9 +72,9 @@ class DemonstrationModification(BaselineRetargeter):
     """Baseline M1: our interpretation of "demonstration modification" in the thesis.
 
     The method combines two published ideas. Argall's advice operators correct a segment of an execution according to a
-    teacher's advice. Mueller et al. 2018 annotate constraints and replace key frames that violate them. The paper that
-    the thesis cites is about policies of a mobile robot. We therefore designed corrections for the motion of an arm. A
-    program, not a teacher, selects these corrections.
+    teacher's advice. Mueller et al. 2018 annotate constraints and replace key frames that violate them. Argall's
+    paper is about policies of a mobile robot. We therefore designed corrections for the motion of an arm. A program,
+    not a teacher, selects these corrections.
 
     The method is offline. :meth:`run` processes the whole recording in four steps:
 
