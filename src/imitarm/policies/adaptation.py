@@ -14,12 +14,11 @@ from imitarm.kinematics.arm import ArmModel, ArmState
 from imitarm.kinematics.arm_kinematics import find_posture
 from imitarm.kinematics.pose import Pose
 from imitarm.perception.margins import CoverageMargin
-from imitarm.policies.adapted_path import Adaptation
+from imitarm.policies.adapted_path import Adaptation, jerk_reason, refusal
 from imitarm.policies.arm_task import ArmSolution, ArmTask
 from imitarm.policies.certificate import ToolAmongObstacles
 from imitarm.policies.certified import CERTIFIED
 from imitarm.policies.component_path import STILL, ComponentPath
-from imitarm.policies.explanations import depends_on_time, jerk_reason, refusal, validity
 from imitarm.policies.least_detour import (
     MAX_JERK_RATIO,
     AllowedDirections,
@@ -163,7 +162,8 @@ def adapt(
     limit = tilt_limits(path, max_tilt, at_goal)
     rest_at_goal = finite_number(hold, "hold", "s", at_least=0.0)
     allowed = allowed_directions(forbidden)
-    margins = margins_in(scene, margin, margin_horizon)
+    exact = (None,) * len(scene.obstacles)
+    margins = exact if margin is None else margins_in(scene, margin, margin_horizon)
     spheres = _spheres(path, tool_radius, tool_spheres, arm)
     tool = ToolAmongObstacles.along(path.nominal, spheres, scene.obstacles, margins)
     nominal = tool.clearance_of(path.nominal.positions)
@@ -235,7 +235,7 @@ def _of_tool(
         validity=validity(scene, path.nominal.duration, tool.margins),
         deviation=used.deviation(detour.displacement),
         jerk_ratio=jerk_ratio,
-        jerk_reason=jerk_reason(scene, detour, jerk_ratio, clearance),
+        jerk_reason="" if jerk_ratio <= MAX_JERK_RATIO else jerk_reason(scene, detour, jerk_ratio, clearance),
         feasible=detour.feasible,
         reason="" if detour.feasible else refusal(scene, problem, detour, method, adapter),
         method=method,
@@ -402,3 +402,42 @@ def _detour(problem: AvoidanceProblem, adapter: PathAdapter) -> Detour:
         if unmoved.feasible or (covered and adapter.refuses):
             return unmoved
     return adapter.detour(problem)
+
+
+def depends_on_time(scene: Scene, margins: Sequence[PredictionMargin | None]) -> bool:
+    """Return whether a guarantee depends on the schedule: because an obstacle moves, or because a margin grows."""
+    growing = any(margin is not None and margin.growth > 0.0 for margin in margins)
+    return growing or any(obstacle.velocity.any() for obstacle in scene.obstacles)
+
+
+def validity(scene: Scene, duration: float, margins: Sequence[PredictionMargin | None], *, arm: bool = False) -> str:
+    """Return a text that says what a guarantee assumes and what it does not cover."""
+    moving = [scene.name_of(i) for i, obstacle in enumerate(scene.obstacles) if obstacle.velocity.any()]
+    covers = "it covers the tool on the planned path, but neither the links of the arm nor tracking errors"
+    if arm:
+        covers = "it covers every moving part of the arm on the planned joint path, but no tracking errors"
+    rotating = [scene.name_of(i) for i, obstacle in enumerate(scene.obstacles) if obstacle.angular_velocity.any()]
+    if rotating:
+        covers += f"; {' and '.join(rotating)} may rotate in any way about the obstacle's centre"
+    if not moving and not depends_on_time(scene, margins):
+        return f"the guarantee holds while the obstacles stand still; {covers}"
+    return (
+        f"the guarantee holds only from 0 to {duration:.2f} s (arrival), and only while the motion is on time and "
+        f"{_assumed(scene, moving, margins)}; {covers}"
+    )
+
+
+def _assumed(scene: Scene, moving: Sequence[str], margins: Sequence[PredictionMargin | None]) -> str:
+    """Return what a guarantee assumes of the obstacles."""
+    kept = f"{' and '.join(moving)} {'keeps' if len(moving) == 1 else 'keep'} the given velocity"
+    with_margin = [scene.name_of(i) for i, margin in enumerate(margins) if margin is not None]
+    if not with_margin:
+        return kept
+    margin = next(margin for margin in margins if margin is not None)
+    verb = "is" if len(with_margin) == 1 else "are"
+    apart = f"{' and '.join(with_margin)} {verb} where predicted, or off by less than {1e3 * margin.offset:.0f} mm"
+    if margin.growth > 0.0:
+        apart += f" and {1e3 * margin.growth:.0f} mm more each second"
+        apart += f" until {margin.until:.2f} s" if np.isfinite(margin.until) else ""
+    others = [name for name in moving if name not in with_margin]
+    return apart if not others else f"{apart}, and {' and '.join(others)} keep the given velocity"

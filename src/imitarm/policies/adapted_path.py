@@ -1,4 +1,4 @@
-"""Adaptation: a path that was adapted to a scene, with its certificate."""
+"""Adaptation: a path that was adapted to a scene, with its certificate, and the texts that explain a refusal."""
 
 from __future__ import annotations
 
@@ -10,6 +10,16 @@ from numpy.typing import NDArray
 from imitarm.html_table import html_table
 from imitarm.policies.approach import Approach
 from imitarm.policies.arm_planner import ArmPlan
+from imitarm.policies.component_path import ComponentPath
+from imitarm.policies.least_detour import (
+    MAX_DISPLACEMENT,
+    MAX_JERK_RATIO,
+    MAX_STEP_RATIO,
+    AvoidanceProblem,
+    Detour,
+    PathAdapter,
+)
+from imitarm.scene.scene import Scene
 from imitarm.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -118,3 +128,72 @@ class Adaptation:
             "compute time": f"{1e3 * self.compute_time:.1f} ms",
         }
         return html_table("Adaptation", rows)
+
+
+def jerk_reason(scene: Scene, detour: Detour, ratio: float, clearance: float) -> str:
+    """Return why the jerk of a path exceeds its limit; empty if it does not."""
+    if ratio <= MAX_JERK_RATIO:
+        return ""
+    tool = detour.clearance.tool
+    pair = int(np.argmin(detour.clearance.distance.min(axis=1))) if tool.n_pairs else 0
+    name = scene.name_of(pair // tool.n_spheres) if tool.n_pairs else "an obstacle"
+    return (
+        f"no smoother path was found that keeps {1e3 * clearance:.0f} mm from {name}: the jerk of the best path is "
+        f"{ratio:.0f} times that of the nominal path (limit {MAX_JERK_RATIO:.0f}); execute it more slowly, or move the "
+        "obstacle"
+    )
+
+
+def refusal(scene: Scene, problem: AvoidanceProblem, detour: Detour, method: str, adapter: PathAdapter) -> str:
+    """Return a message that says which obstacle can't be avoided, why, and what to change."""
+    path, k = problem.path, problem.nominal.tool.n_spheres
+    required = f"{1e3 * problem.clearance:.0f} mm required"
+    if any(margin is not None for margin in problem.nominal.tool.margins):
+        required += " beyond the margin for its prediction"
+    fixed = path.fixed
+    at_fixed = problem.nominal.distance[:, fixed]
+    if at_fixed.min(initial=np.inf) < problem.clearance:
+        pair, i = np.unravel_index(int(np.argmin(at_fixed)), at_fixed.shape)
+        return _at_fixed(path, scene.name_of(pair // k), int(fixed[i]), float(at_fixed.min()), required)
+    worst = int(np.argmin(detour.bounds))
+    name = scene.name_of(worst // k)
+    left = f"{1e3 * float(detour.bounds[worst]) + 0.0:.1f} mm"
+    if not adapter.refuses:
+        return (
+            f"the path passes {name} at a distance of {left} ({required}): method {method!r} pushes components and "
+            "ignores the path between them; try method 'certified'"
+        )
+    if not problem.allowed.dimension:
+        return (
+            f"{name} blocks the path ({left} of clearance, {required}), and every direction is forbidden: allow "
+            f"at least one direction"
+        )
+    if detour.out_of_limits:
+        far = np.linalg.norm(detour.clearance.positions - path.nominal.positions, axis=1).max()
+        return (
+            f"no path around {name} with {required} within the limits: the path would lead {far:.2f} m away from the "
+            f"nominal path (limit {MAX_DISPLACEMENT:g} m) or have steps longer than {MAX_STEP_RATIO:.0f} times the "
+            "longest nominal step; move the obstacle, or reduce the required clearance"
+        )
+    near = {pair // k for pair in np.flatnonzero(detour.bounds < problem.clearance).tolist()} - {worst // k}
+    sample = int(np.argmin(detour.clearance.distance[worst]))
+    held = path.basis[sample].sum() < 0.5
+    n_forbidden = len(problem.allowed.forbidden)
+    clauses = [
+        f"no path around {name} with {required}: the best attempt has a clearance of {left}",
+        f"other obstacles that are too close: {', '.join(map(scene.name_of, sorted(near)))}" if near else "",
+        "the obstacle is too close to a point that must not move" if held else "",
+        f"the path may not move in {n_forbidden} forbidden direction(s)" if n_forbidden else "",
+        "move an obstacle, allow another direction, or reduce the required clearance",
+    ]
+    return "; ".join(filter(None, clauses))
+
+
+def _at_fixed(path: ComponentPath, name: str, sample: int, left: float, required: str) -> str:
+    """Return a message which says that an obstacle is too close to a point that must not move."""
+    at, end = path.nominal.times[sample], path.nominal.times[-1]
+    where = "start" if at < 0.02 * end else "goal" if at > 0.98 * end else f"pinned point at {at:.2f} s"
+    gap = f"leaves {1e3 * left:.0f} mm of clearance at the {where} ({required})"
+    lies = f"covers the {where}" if left <= 0.0 and required.endswith("required") else gap
+    other = where if where in {"start", "goal"} else "pinned time"
+    return f"{name} {lies}; this point must not move: move the obstacle, or choose another {other}"

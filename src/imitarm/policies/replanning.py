@@ -11,11 +11,10 @@ from numpy.typing import ArrayLike
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel, ArmState
 from imitarm.perception.margins import CoverageMargin
-from imitarm.policies.adaptation import allowed_directions, of_whole_arm, tilt_limits
+from imitarm.policies.adaptation import allowed_directions, depends_on_time, of_whole_arm, tilt_limits
 from imitarm.policies.adapted_path import Adaptation
 from imitarm.policies.arm_task import ArmTask
 from imitarm.policies.component_path import STILL
-from imitarm.policies.explanations import depends_on_time
 from imitarm.policies.prediction_margin import margins_in
 from imitarm.policies.remainder import Remainder
 from imitarm.policies.whole_arm import solve
