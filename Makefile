@@ -92,7 +92,7 @@ $(VENV)/.dev: $(BIN)/python pyproject.toml
 	@touch $@
 
 $(VENV)/.bench: $(VENV)/.dev pyproject.toml
-	$(BIN)/python -m pip install --quiet --editable '.[dev,bench,oink]'
+	$(BIN)/python -m pip install --quiet --editable '.[dev,bench]'
 	@touch $@
 
 # order-only: neither changes with what imitarm needs

@@ -46,7 +46,7 @@ SAYS = {
         r"take 4: 5\.\d s, \d{1,2} mm from the true hand on average, (\d\d|100) % of the velocity limit and",
         r"learned \d+ components from 5 recordings of a person",
         r"nothing in the way: finished",
-        r"a ball on the path: finished, .*, \d\d mm from the ball",
+        r"a ball on the path: finished[,;] .*, \d\d mm from the ball",
     ],
     "07_reach_into_an_open_box": [
         r"10 teachers: \d mm from the ideal path",

@@ -327,6 +327,7 @@ GOOD = {
     "sew_points": {"q": Q},
     "sew_jacobians": {"q": Q},
     "collision_spheres": {"q": Q},
+    "sphere_centers": {"q": Q},
     "sphere_jacobians": {"q": Q},
     "gravity_torque": {"q": Q},
     "inverse_dynamics": {"q": Q, "qd": Q, "qdd": Q},
