@@ -97,11 +97,12 @@ def figure_5_3() -> Figure:
     policy = RCAMO(skill, tool_spheres=_TOOL, forbidden=HORIZONTAL_ONLY)
     nominal = skill.generate(dt=_DT).positions
     scenes = (Scene(), Scene(None, (ball,)))
+    path = tool_alone(policy, scenes[1].at, 2.0 * skill.duration_)
     figure = Figure(figsize=(8.0, 4.6), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
     titles = ("(a) no obstacle", f"(b) a ball that crosses the path, at {time:.1f} s")
     for axes, scene, title in zip(panels, scenes, titles, strict=True):
-        grid = framed(axes, nominal)
+        grid = framed(axes, np.concatenate([nominal, path]))
         points = np.empty((len(grid.up), len(grid.across), 3))
         points[..., 1], points[..., 0] = np.meshgrid(grid.across, grid.up)
         points[..., 2] = nominal[len(nominal) // 2, 2]
@@ -110,7 +111,6 @@ def figure_5_3() -> Figure:
         colours = axes.pcolormesh(grid.across, grid.up, np.clip(cost, 1e-3, 10.0), **look)
         axes.plot(*_VIEW.of(nominal).T, "w:", lw=1.4, label="primitive (DMP)")
         if scene.obstacles:
-            path = tool_alone(policy, scene.at, 2.0 * skill.duration_)
             axes.plot(*_VIEW.of(path).T, color="white", lw=1.8, label="path of the tool")
             track = np.array([ball.after(t).center for t in np.linspace(time - 1.5, time + 1.5, 13)])
             axes.plot(*_VIEW.of(track).T, "k.", ms=3.0, label="ball, every 0.25 s")
