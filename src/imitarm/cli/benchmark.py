@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import importlib.util
 import math
 import tempfile
@@ -20,7 +19,11 @@ from imitarm.benchmark.placement_tables import placement_tables
 from imitarm.benchmark.provenance import code_version, origin
 from imitarm.benchmark.recordings import KINDS
 from imitarm.benchmark.refusal_proof import Answer
+from imitarm.cli.benchmark_moving import add_moving
 from imitarm.cli.benchmark_options import add_fill, add_workers, place_of, report_tables, workers_of
+from imitarm.cli.benchmark_perception import add_perception
+from imitarm.cli.benchmark_static import add_static
+from imitarm.cli.benchmark_tracking import add_tracking
 from imitarm.cli.outputs import check_outputs, same_place
 from imitarm.cli.robot_options import add_robot_options
 from imitarm.cli.run_scene import provenance
@@ -30,12 +33,7 @@ from imitarm.policies import POLICIES
 from imitarm.policies.adaptation import ADAPTERS
 from imitarm.tasks.packing_run import OBSERVERS
 
-OTHERS = (
-    "imitarm.cli.benchmark_static:add_static",
-    "imitarm.cli.benchmark_tracking:add_tracking",
-    "imitarm.cli.benchmark_perception:add_perception",
-    "imitarm.cli.benchmark_moving:add_moving",
-)
+OTHERS = (add_static, add_moving, add_tracking, add_perception)
 """Benchmarks with a file of their own: the functions that add their parsers."""
 
 EPILOG = """\
@@ -140,9 +138,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_workers(packed)
     add_fill(packed)
     packed.set_defaults(benchmark=_packing)
-    for member in OTHERS:
-        module, _, function = member.partition(":")
-        getattr(importlib.import_module(module), function)(parsers)
+    for add in OTHERS:
+        add(parsers)
     people = parsers.add_parser("people", help="retarget recordings of real people to simulated arms")
     people.add_argument(
         "data",

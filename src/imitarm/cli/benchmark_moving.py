@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import time
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +14,10 @@ from imitarm.benchmark.moving_scenes import FAMILIES
 from imitarm.benchmark.moving_tables import family_table, moving_tables, success_table
 from imitarm.benchmark.person_arm import DATA, has_recordings
 from imitarm.benchmark.provenance import code_version, origin
-from imitarm.benchmark.running import run_experiments
 from imitarm.benchmark.static_scenes import SPLITS
-from imitarm.cli.benchmark_options import add_fill, add_workers, place_of, report_tables, workers_of
+from imitarm.cli.benchmark_options import add_fill, add_workers, place_of, report_tables, run_with_progress, workers_of
 from imitarm.cli.outputs import check_outputs
-from imitarm.cli.screen import progress_bar, remark, say
+from imitarm.cli.screen import remark, say
 from imitarm.errors import InputError
 
 _FOLDER = Path("benchmark-moving")
@@ -117,22 +115,12 @@ def _run(arguments: argparse.Namespace) -> int:
     """Run the experiments; print the rates of success."""
     wanted, workers = experiments_of(arguments), workers_of(arguments)
     store = MovingLines(arguments.out, reuse=arguments.reuse)
-    began, kept = time.perf_counter(), [0]
-
-    def on_done(done: int, of: int) -> None:
-        if not bar.tasks:
-            kept[0] = done
-            bar.add_task("moving", total=of)
-        bar.update(bar.tasks[0].id, completed=done)
-
-    with progress_bar() as bar:
-        done = run_experiments(wanted, run_experiment, store, workers, fresh=arguments.fresh, on_done=on_done)
-    seconds, ran = time.perf_counter() - began, len(done) - kept[0]
-    results = MovingResults(done)
+    done = run_with_progress("moving", wanted, run_experiment, store, workers, fresh=arguments.fresh)
+    results = MovingResults(done.outcomes)
     for world in results.worlds:
         own = results.in_world(world)
         report_tables([success_table(own), family_table(own)], None, [code_version()])
-    say(f"{ran} experiments in {seconds:.0f} s; {kept[0]} were saved before")
+    say(done.summary)
     say(f"compare the methods: imitarm benchmark moving compare {arguments.out}")
     return 0
 

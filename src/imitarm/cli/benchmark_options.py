@@ -5,12 +5,15 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Generic
 
-from imitarm.benchmark.running import LOCAL, Workers
+from imitarm.benchmark.running import LOCAL, Outcome, Store, Work, Workers, run_experiments
 from imitarm.benchmark.tables import Place, Table
-from imitarm.cli.screen import say, show_table
+from imitarm.cli.screen import progress_bar, say, show_table
 from imitarm.errors import InputError
 
 
@@ -37,6 +40,54 @@ def workers_of(arguments: argparse.Namespace) -> Workers:
     if arguments.jobs is not None and arguments.jobs < 1:
         raise InputError(f"--jobs must be at least 1, got {arguments.jobs}")
     return Workers(arguments.jobs, arguments.backend, arguments.scheduler)
+
+
+@dataclass(frozen=True)
+class Finished(Generic[Outcome]):
+    """What running experiments gave.
+
+    Attributes:
+        outcomes: all results, in the order of the experiments.
+        kept: number of results that were saved before.
+        seconds: duration of the run [s].
+    """
+
+    outcomes: list[Outcome]
+    kept: int
+    seconds: float
+
+    @property
+    def summary(self) -> str:
+        """A sentence about the run."""
+        ran = len(self.outcomes) - self.kept
+        speed = 60.0 * ran / self.seconds
+        return f"{ran} experiments in {self.seconds:.0f} s: {speed:.0f} per minute; {self.kept} were saved before"
+
+
+def run_with_progress(
+    name: str,
+    wanted: Sequence[Work],
+    run: Callable[[Work], Outcome],
+    store: Store[Work, Outcome],
+    workers: Workers,
+    *,
+    fresh: bool,
+) -> Finished[Outcome]:
+    """Run experiments with a progress bar; results that were saved before are used unless ``fresh`` is set.
+
+    The bar is called ``name``. The other arguments are those of :func:`~imitarm.benchmark.running.run_experiments`.
+    """
+    began, kept = time.perf_counter(), [0]
+
+    def on_done(done: int, of: int) -> None:
+        if not bar.tasks:
+            kept[0] = done
+            bar.add_task(name, total=of)
+        bar.update(bar.tasks[0].id, completed=done)
+
+    with progress_bar() as bar:
+        done = run_experiments(wanted, run, store, workers, fresh=fresh, on_done=on_done)
+    return Finished(done, kept[0], time.perf_counter() - began)
 
 
 def add_fill(parser: argparse.ArgumentParser) -> None:

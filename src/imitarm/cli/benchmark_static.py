@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +26,15 @@ from imitarm.benchmark.static_scaling import scaling_tables
 from imitarm.benchmark.static_scenes import FAMILIES, SPLITS
 from imitarm.benchmark.static_tables import ORACLE, OURS, StaticResults, checked_refusals_table, success_table
 from imitarm.benchmark.static_tuning import DRAWS, Search, tune, tuned_options, write_tuned
-from imitarm.cli.benchmark_options import add_fill, add_workers, command_line, place_of, report_tables, workers_of
+from imitarm.cli.benchmark_options import (
+    add_fill,
+    add_workers,
+    command_line,
+    place_of,
+    report_tables,
+    run_with_progress,
+    workers_of,
+)
 from imitarm.cli.outputs import check_outputs
 from imitarm.cli.screen import progress_bar, remark, say
 from imitarm.errors import InputError
@@ -163,21 +170,10 @@ def _run(arguments: argparse.Namespace) -> int:
     """Run the experiments; print the rates of success, the speed, and how the time depends on the obstacles."""
     wanted, workers = experiments_of(arguments), workers_of(arguments)
     store = ResultLines(arguments.out, reuse=arguments.reuse)
-    began, kept = time.perf_counter(), [0]
-
-    def on_done(done: int, of: int) -> None:
-        if not bar.tasks:
-            kept[0] = done
-            bar.add_task("planning", total=of)
-        bar.update(bar.tasks[0].id, completed=done)
-
-    with progress_bar() as bar:
-        done = run_experiments(wanted, run_experiment, store, workers, fresh=arguments.fresh, on_done=on_done)
-    seconds, ran = time.perf_counter() - began, len(done) - kept[0]
-    results = StaticResults(done)
+    done = run_with_progress("planning", wanted, run_experiment, store, workers, fresh=arguments.fresh)
+    results = StaticResults(done.outcomes)
     report_tables([success_table(results)], None, [code_version()])
-    speed = 60.0 * ran / seconds
-    say(f"{ran} experiments in {seconds:.0f} s: {speed:.0f} scenes per minute; {kept[0]} were saved before")
+    say(done.summary)
     for row in results.rows:
         slope, error, n = cost_law(results, row)
         if row.split(",")[0] == OURS and n > 2:
