@@ -14,7 +14,7 @@ import pytest
 from distributed import Client
 
 from imitarm.benchmark.running import DASK, Store, Workers, run_experiments
-from imitarm.benchmark.static import ResultLines, StaticExperiment, run_experiment
+from imitarm.benchmark.static import RESULTS, StaticExperiment, run_experiment
 from imitarm.errors import InputError, TaskFailedError
 
 pytestmark = [
@@ -83,7 +83,7 @@ def test_results_of_two_workers_are_those_of_this_process(tmp_path):
         assert told[0] == (0, 40) and told[-1] == (40, 40)
 
         scenes = [StaticExperiment("S1", d, seed, "acfra") for d in (2, 3) for seed in (1000, 1001)]
-        stores = [ResultLines(tmp_path / name) for name in ("here", "there")]
+        stores = [RESULTS.store(tmp_path / name) for name in ("here", "there")]
         here = run_experiments(scenes, run_experiment, stores[0], Workers(1))
         there = run_experiments(scenes, run_experiment, stores[1], Workers(backend=DASK, scheduler=address))
         assert [r.values["clearance"] for r in there] == [r.values["clearance"] for r in here]

@@ -14,7 +14,7 @@ from imitarm.benchmark.moving import OURS, MovingExperiment, build, default_meth
 from imitarm.benchmark.moving_controls import Grid, search
 from imitarm.benchmark.moving_measures import Contact, contacts, limits_kept, measured, tracking
 from imitarm.benchmark.moving_motions import AWAY, appearing, stop_and_go, turning, weaving
-from imitarm.benchmark.moving_results import MovingLines, MovingResults, json_line, read_folders, read_lines, result_of
+from imitarm.benchmark.moving_results import RESULTS, MovingResults
 from imitarm.benchmark.moving_scenes import FAMILIES, FASTEST, LONGEST, MovingCase, distances_in_time, moving_case
 from imitarm.benchmark.moving_tables import moving_tables
 from imitarm.benchmark.moving_world import DT, Seen, ToolRun, run_tool, within_limits
@@ -289,7 +289,9 @@ def test_methods_are_known_and_can_be_built():
 def test_a_whole_arm_moves_among_the_same_obstacles():
     result = MovingExperiment("M3", 3, 1000, "rcamo", world="sawyer").run()
     assert result.outcome in {"success", "too near"} and result.value("clearance") > 0.0
-    assert result.value("position_error") < 0.05 and result_of(json_line(result)).experiment == result.experiment
+    assert (
+        result.value("position_error") < 0.05 and RESULTS.result(RESULTS.line(result)).experiment == result.experiment
+    )
     tables = moving_tables(MovingResults([result]))
     assert tables and all(table.title.startswith("sawyer: ") for table in tables)
 
@@ -309,17 +311,17 @@ def test_worlds_are_checked():
 
 def test_results_are_saved_and_read(tmp_path):
     result = MovingExperiment("M1", 2, 1000, "no-avoidance").run()
-    again = result_of(json_line(result))
+    again = RESULTS.result(RESULTS.line(result))
     assert again.experiment == result.experiment and again.outcome == result.outcome
-    store = MovingLines(tmp_path)
+    store = RESULTS.store(tmp_path)
     store.save(result.experiment, result)
     assert set(store.known([result.experiment])) == {result.experiment}
-    assert len(read_folders([tmp_path])) == 1
+    assert len(RESULTS.read_folders([tmp_path])) == 1
     with (tmp_path / "no-avoidance.jsonl").open("a") as file:
         file.write('{"format": "imit')
-    assert len(read_lines(tmp_path / "no-avoidance.jsonl")) == 1
+    assert len(RESULTS.read(tmp_path / "no-avoidance.jsonl")) == 1
     with pytest.raises(InputError, match="no such folder"):
-        read_folders([tmp_path / "nothing"])
+        RESULTS.read_folders([tmp_path / "nothing"])
 
 
 def test_the_command_runs_resumes_and_compares(tmp_path, capsys):
@@ -357,7 +359,7 @@ def test_tables_need_no_particular_rows():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(path.stem for path in SAVED.glob("*.jsonl")))
 def test_a_small_part_gives_the_saved_results(name):
-    for saved in read_lines(SAVED / f"{name}.jsonl"):
+    for saved in RESULTS.read(SAVED / f"{name}.jsonl"):
         found = saved.experiment.run()
         if name in OURS:  # they may be improved; success must stay
             assert found.success >= saved.success, f"{saved.experiment}: {found.reason}; {RENEW}"

@@ -16,18 +16,7 @@ from imitarm.benchmark import static_measures
 from imitarm.benchmark.controls import AimsAtObstacle, NoAvoidance, middle
 from imitarm.benchmark.result_lines import SUFFIX
 from imitarm.benchmark.running import Workers, run_experiments
-from imitarm.benchmark.static import (
-    ResultLines,
-    StaticExperiment,
-    build,
-    json_line,
-    method_names,
-    read_folders,
-    read_lines,
-    result_of,
-    run_experiment,
-    torques_on_sawyer,
-)
+from imitarm.benchmark.static import RESULTS, StaticExperiment, build, method_names, run_experiment, torques_on_sawyer
 from imitarm.benchmark.static_measures import (
     AT_GOAL,
     LATEST,
@@ -313,23 +302,25 @@ def test_all_methods_have_a_name():
 def test_a_result_is_read_as_it_was_written():
     for experiment in (ONE, StaticExperiment("S6", 2, 1001, "acfra", options=(("b", 2.0), ("a", "x")))):
         result = experiment.run()
-        read = result_of(json_line(result))
+        read = RESULTS.result(RESULTS.line(result))
         assert read.experiment == experiment
-        assert json_line(read) == json_line(result)
+        assert RESULTS.line(read) == RESULTS.line(result)
 
 
 def test_results_do_not_depend_on_the_workers(tmp_path):
     wanted = [replace(ONE, method=m, seed=s) for m in ("acfra", "acfra-mapf") for s in (1000, 1001, 1002)]
-    alone = run_experiments(wanted, run_experiment, ResultLines(tmp_path / "a"), Workers(1))
-    both = run_experiments(wanted, run_experiment, ResultLines(tmp_path / "b"), Workers(2))
+    alone = run_experiments(wanted, run_experiment, RESULTS.store(tmp_path / "a"), Workers(1))
+    both = run_experiments(wanted, run_experiment, RESULTS.store(tmp_path / "b"), Workers(2))
     assert [r.experiment for r in both] == wanted
     assert [without_clock(r) for r in alone] == [without_clock(r) for r in both]
-    assert {without_clock(r) for r in read_folders([tmp_path / "a", tmp_path / "b"])} == set(map(without_clock, both))
+    assert {without_clock(r) for r in RESULTS.read_folders([tmp_path / "a", tmp_path / "b"])} == set(
+        map(without_clock, both)
+    )
 
 
 def test_an_incomplete_line_is_run_again_and_no_other(tmp_path):
     wanted = [replace(ONE, seed=s) for s in (1000, 1001, 1002)]
-    store = ResultLines(tmp_path)
+    store = RESULTS.store(tmp_path)
     first = run_experiments(wanted, run_experiment, store, Workers(1))
     path = tmp_path / f"acfra{SUFFIX}"
     whole = path.read_bytes()
@@ -339,20 +330,20 @@ def test_an_incomplete_line_is_run_again_and_no_other(tmp_path):
         again = run_experiments(wanted, run_experiment, store, Workers(1), on_done=lambda *n, t=told: t.append(n))
         assert told[0][0] == (3 if cut == 1 else 2)
         assert [without_clock(r) for r in again] == [without_clock(r) for r in first]
-        assert len(read_lines(path)) == 3
+        assert len(RESULTS.read(path)) == 3
     path.write_bytes(whole.replace(b'"code":"', b'"code":"old '))
     assert not store.known(wanted)
-    assert len(ResultLines(tmp_path, reuse=True).known(wanted)) == 3
+    assert len(RESULTS.store(tmp_path, reuse=True).known(wanted)) == 3
 
 
 def test_a_folder_that_cant_be_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="another folder"):
-        ResultLines(tmp_path / "file" / "x")
+        RESULTS.store(tmp_path / "file" / "x")
     with pytest.raises(InputError, match="no such folder"):
-        read_folders([tmp_path / "nowhere"])
+        RESULTS.read_folders([tmp_path / "nowhere"])
     with pytest.raises(InputError, match="holds no results"):
-        read_folders([tmp_path])
+        RESULTS.read_folders([tmp_path])
 
 
 @pytest.mark.slow
@@ -362,11 +353,10 @@ def test_a_run_that_is_killed_again_and_again_loses_nothing(tmp_path):
     script = (
         "import sys\n"
         "from imitarm.benchmark.running import Workers, run_experiments\n"
-        "from imitarm.benchmark.static import StaticExperiment, run_experiment\n"
-        "from imitarm.benchmark.static import ResultLines\n"
+        "from imitarm.benchmark.static import RESULTS, StaticExperiment, run_experiment\n"
         "if __name__ == '__main__':\n"
         "    wanted = [StaticExperiment('S1', 2, s, 'acfra') for s in range(1000, 1150)]\n"
-        "    run_experiments(wanted, run_experiment, ResultLines(sys.argv[1]), Workers(2))\n"
+        "    run_experiments(wanted, run_experiment, RESULTS.store(sys.argv[1]), Workers(2))\n"
     )
     program = tmp_path / "program.py"
     program.write_text(script)
@@ -382,19 +372,19 @@ def test_a_run_that_is_killed_again_and_again_loses_nothing(tmp_path):
         time.sleep(rng.uniform(0.0, 0.1))
         child.send_signal(signal.SIGKILL)
         child.wait(timeout=60)
-        found = len(read_lines(path))
+        found = len(RESULTS.read(path))
         assert found > saved
         saved = found
     wanted = [StaticExperiment("S1", 2, s, "acfra") for s in range(1000, 1150)]
-    kept = {r.experiment: json_line(r) for r in read_lines(path)}
-    results = run_experiments(wanted, run_experiment, ResultLines(out), Workers(1))
+    kept = {r.experiment: RESULTS.line(r) for r in RESULTS.read(path)}
+    results = run_experiments(wanted, run_experiment, RESULTS.store(out), Workers(1))
     assert len(results) == 150
-    assert all(json_line(r) == kept[r.experiment] for r in results if r.experiment in kept)
+    assert all(RESULTS.line(r) == kept[r.experiment] for r in results if r.experiment in kept)
     assert without_clock(results[0]) == without_clock(wanted[0].run())
 
 
 def test_a_full_disk_is_told_and_what_is_saved_stays(tmp_path, monkeypatch):
-    store = ResultLines(tmp_path)
+    store = RESULTS.store(tmp_path)
     (first,) = run_experiments([ONE], run_experiment, store, Workers(1))
     target = tmp_path / f"acfra{SUFFIX}"
     target.unlink()

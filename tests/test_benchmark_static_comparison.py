@@ -12,7 +12,7 @@ from scipy.stats import binomtest, wilcoxon
 from imitarm import cli
 from imitarm.benchmark import static_tuning
 from imitarm.benchmark.running import Workers
-from imitarm.benchmark.static import ResultLines, StaticExperiment, StaticResult, json_line, policy_class, read_lines
+from imitarm.benchmark.static import RESULTS, StaticExperiment, StaticResult, policy_class
 from imitarm.benchmark.static_claims import claims_table, cost_law, static_tables
 from imitarm.benchmark.static_comparison import PRINTED, mcnemar, pairing, pairings, printed_table, signed_rank, task_of
 from imitarm.benchmark.static_scaling import Plan, exponent, plan_once, scaling_case
@@ -210,7 +210,7 @@ def test_success_decides_and_then_the_rmse():
 
 def test_a_search_is_logged_resumed_and_saved(tmp_path):
     search = Search((("S1", 2, 1000), ("S1", 2, 1001)), draws=2)
-    store, log = ResultLines(tmp_path), tmp_path / "log"
+    store, log = RESULTS.store(tmp_path), tmp_path / "log"
     told = []
     best = tune(["acfra", "no-avoidance"], search, store, Workers(1), log=log, on_done=lambda *n: told.append(n))
     assert told[-1][0] == told[-1][1]
@@ -313,7 +313,7 @@ RENEW = (
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(path.stem for path in SAVED.glob("*.jsonl")))
 def test_a_small_part_gives_the_saved_results(name):
-    for saved in read_lines(SAVED / f"{name}.jsonl"):
+    for saved in RESULTS.read(SAVED / f"{name}.jsonl"):
         found = saved.experiment.run()
         where = f"{saved.experiment}; {RENEW}"
         assert (found.outcome, set(found.values)) == (saved.outcome, set(saved.values)), where
@@ -400,7 +400,7 @@ def test_tuning_is_a_command(tmp_path, capsys):
 
 
 def test_lines_of_results_are_read_back_by_the_comparison(tmp_path):
-    store = ResultLines(tmp_path)
+    store = RESULTS.store(tmp_path)
     for r in (oracle(0), result("acfra", 0, "success")):
         store.save(r.experiment, r)
-        assert json_line(store.save(r.experiment, r)) == json_line(r)
+        assert RESULTS.line(store.save(r.experiment, r)) == RESULTS.line(r)

@@ -3,63 +3,19 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
-from pathlib import Path
 
-from imitarm.benchmark import result_lines
 from imitarm.benchmark.moving import MovingExperiment, MovingResult
 from imitarm.benchmark.moving_controls import CONTROLS
 from imitarm.benchmark.moving_scenes import FAMILIES
-from imitarm.benchmark.result_lines import LineStore, results_in, results_of_folders
+from imitarm.benchmark.result_lines import ResultFormat
 
-FORMAT = "imitarm-moving-result 1"
 Scene = tuple[str, int, int]
 
 
-class MovingLines(LineStore[MovingExperiment, MovingResult]):
-    """The results of the moving benchmark, see :class:`~imitarm.benchmark.result_lines.LineStore`."""
-
-    def line(self, outcome: MovingResult) -> str:
-        """Return a result as one line of JSON."""
-        return json_line(outcome)
-
-    def result(self, line: str) -> MovingResult:
-        """Return the result in a line.
-
-        Raises:
-            ValueError: when the line is not a result of this version.
-        """
-        return result_of(line)
-
-
-def json_line(result: MovingResult) -> str:
-    """Return a result as one line of JSON; null stands for nan."""
-    return result_lines.json_line(result, FORMAT)
-
-
-def result_of(line: str) -> MovingResult:
-    """Return the result in a line of JSON.
-
-    Raises:
-        ValueError: when the line is not JSON.
-        FileFormatError: when the line is not a result of this version.
-    """
-    return result_lines.from_json(line, FORMAT, MovingExperiment, MovingResult)
-
-
-def read_lines(path: Path) -> list[MovingResult]:
-    """Return the results in a file; lines that can't be read are left out."""
-    return results_in(path, result_of)
-
-
-def read_folders(folders: Iterable[str | Path]) -> list[MovingResult]:
-    """Return the results of all folders; when an experiment has several results, the last one counts.
-
-    Raises:
-        InputError: when a folder does not exist or holds no results.
-    """
-    return results_of_folders(folders, result_of, "imitarm benchmark moving")
+RESULTS = ResultFormat("imitarm-moving-result 1", MovingExperiment, MovingResult, "imitarm benchmark moving")
+"""How results are written and read."""
 
 
 class MovingResults:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic
 
 from imitarm.benchmark.experiment import plain
 from imitarm.benchmark.provenance import code_version
@@ -18,6 +17,98 @@ from imitarm.errors import FileFormatError, InputError
 SUFFIX = ".jsonl"
 
 
+@dataclass(frozen=True)
+class ResultFormat(Generic[Work, Outcome]):
+    """How the results of one benchmark are written: one line of JSON for each.
+
+    A result has the attributes ``experiment``, ``code``, ``outcome``, ``reason`` and ``values``, in this order; an
+    experiment is a dataclass with an attribute ``method``.
+
+    Attributes:
+        name: name and version of the format.
+        experiment: class of the experiments.
+        outcome: class of the results.
+        command: command that makes a folder of results, for messages.
+    """
+
+    name: str
+    experiment: Callable[..., Work]
+    outcome: Callable[..., Outcome]
+    command: str
+
+    def store(self, folder: str | Path, *, reuse: bool = False) -> LineStore[Work, Outcome]:
+        """Return the store of results in a folder.
+
+        Args:
+            folder: the folder; created if missing.
+            reuse: whether a result of another version of the code is valid.
+
+        Raises:
+            InputError: when the folder can't be written to.
+        """
+        return LineStore(folder, self, reuse=reuse)
+
+    def line(self, result: Any) -> str:
+        """Return a result as one line of JSON; null stands for nan."""
+        content = {
+            "format": self.name,
+            "experiment": asdict(result.experiment),
+            "code": result.code,
+            "outcome": result.outcome,
+            "reason": result.reason,
+            "values": plain(dict(result.values)),
+        }
+        return json.dumps(content, allow_nan=False, separators=(",", ":"))
+
+    def result(self, line: str) -> Outcome:
+        """Return the result in a line of JSON.
+
+        Raises:
+            ValueError: when the line is not JSON.
+            FileFormatError: when the line is not a result of this version.
+        """
+        content: dict[str, Any] = json.loads(line)
+        try:
+            if content["format"] != self.name:
+                raise FileFormatError(f"is not a result of this version ({self.name!r})")
+            facts = content["experiment"]
+            if "options" in facts:
+                facts["options"] = tuple((name, value) for name, value in facts["options"])
+            values = content["code"], content["outcome"], content["reason"], content["values"]
+            return self.outcome(self.experiment(**facts), *values)
+        except (KeyError, TypeError, AttributeError) as error:
+            raise FileFormatError(f"is not a result ({type(error).__name__}: {error})") from error
+
+    def read(self, path: Path) -> list[Outcome]:
+        """Return the results in a file; lines that can't be read are left out."""
+        if not path.exists():
+            return []
+        found = []
+        with path.open(encoding="utf-8", errors="replace") as lines:
+            for line in lines:
+                try:
+                    found.append(self.result(line))
+                except ValueError:  # an incomplete line, or a method that no longer exists
+                    continue
+        return found
+
+    def read_folders(self, folders: Iterable[str | Path]) -> list[Outcome]:
+        """Return the results of all folders; when an experiment has several results, the last one counts.
+
+        Raises:
+            InputError: when a folder does not exist or holds no results.
+        """
+        found: dict[Any, Outcome] = {}
+        for folder in map(Path, folders):
+            if not folder.is_dir():
+                raise InputError(f"{folder}: there is no such folder; '{self.command} --out {folder}' makes one")
+            here: list[Any] = [r for path in sorted(folder.glob(f"*{SUFFIX}")) for r in self.read(path)]
+            found.update({saved.experiment: saved for saved in here})
+            if not here:
+                raise InputError(f"{folder}: holds no results of '{self.command}'")
+        return list(found.values())
+
+
 class LineStore(Store[Work, Outcome]):
     """A folder with one file for each method, and one line in it for each experiment.
 
@@ -25,19 +116,17 @@ class LineStore(Store[Work, Outcome]):
     incomplete line at the end of a file. Such a line is ignored when the file is read, and the next result begins a new
     line. When an experiment has several lines, the last one counts.
 
-    A subclass says how a result is written and read. Results have the attributes ``experiment`` and ``code``, and
-    experiments have the attribute ``method``.
-
     Args:
         folder: the folder; created if missing.
+        form: how a result is written.
         reuse: whether a result of another version of the code is valid.
 
     Raises:
         InputError: when the folder can't be written to.
     """
 
-    def __init__(self, folder: str | Path, *, reuse: bool = False) -> None:
-        self.folder, self.reuse = Path(folder), reuse
+    def __init__(self, folder: str | Path, form: ResultFormat[Work, Outcome], *, reuse: bool = False) -> None:
+        self.folder, self.form, self.reuse = Path(folder), form, reuse
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -45,24 +134,12 @@ class LineStore(Store[Work, Outcome]):
                 f"{folder}: results can't be saved there ({error.strerror}); name another folder"
             ) from error
 
-    @abstractmethod
-    def line(self, outcome: Outcome) -> str:
-        """Return a result as one line of JSON."""
-
-    @abstractmethod
-    def result(self, line: str) -> Outcome:
-        """Return the result in a line.
-
-        Raises:
-            ValueError: when the line is not a result of this version.
-        """
-
     def known(self, experiments: Sequence[Work]) -> dict[Work, Outcome]:
         """Return the saved results; results that are unreadable or (without ``reuse``) of other code are left out."""
         wanted = set(experiments)
         found: dict[Work, Outcome] = {}
         for method in dict.fromkeys(_method(e) for e in experiments):
-            for result in results_in(self.path(method), self.result):
+            for result in self.form.read(self.path(method)):
                 saved: Any = result
                 if saved.experiment in wanted and (self.reuse or saved.code == code_version()):
                     found[saved.experiment] = result
@@ -74,7 +151,7 @@ class LineStore(Store[Work, Outcome]):
         Raises:
             OSError: when the line can't be written.
         """
-        line = self.line(outcome)
+        line = self.form.line(outcome)
         data = line.encode() + b"\n"
         with self.path(_method(experiment)).open("a+b", buffering=0) as file:
             end = file.seek(0, os.SEEK_END)
@@ -84,90 +161,12 @@ class LineStore(Store[Work, Outcome]):
                     data = b"\n" + data
             if file.write(data) != len(data):
                 raise OSError(28, "the disk is full")
-        return self.result(line)
+        return self.form.result(line)
 
     def path(self, method: str) -> Path:
         """Return the file of a method."""
         return self.folder / f"{method}{SUFFIX}"
 
 
-def json_line(result: Any, form: str) -> str:
-    """Return a result as one line of JSON; null stands for nan.
-
-    Args:
-        result: an object with experiment (a dataclass), code, outcome, reason and values.
-        form: name and version of the form.
-    """
-    content = {
-        "format": form,
-        "experiment": asdict(result.experiment),
-        "code": result.code,
-        "outcome": result.outcome,
-        "reason": result.reason,
-        "values": plain(dict(result.values)),
-    }
-    return json.dumps(content, allow_nan=False, separators=(",", ":"))
-
-
-def from_json(line: str, form: str, experiment: Callable[..., Work], result: Callable[..., Outcome]) -> Outcome:
-    """Return the result in a line of JSON.
-
-    Args:
-        line: what :func:`json_line` returned.
-        form: name and version of the form.
-        experiment: class of the experiment.
-        result: class of the result.
-
-    Raises:
-        ValueError: when the line is not JSON.
-        FileFormatError: when the line is not a result of this version.
-    """
-    content: dict[str, Any] = json.loads(line)
-    try:
-        if content["format"] != form:
-            raise FileFormatError(f"is not a result of this version ({form!r})")
-        facts = content["experiment"]
-        facts["options"] = tuple((name, value) for name, value in facts["options"])
-        return result(experiment(**facts), content["code"], content["outcome"], content["reason"], content["values"])
-    except (KeyError, TypeError, AttributeError) as error:
-        raise FileFormatError(f"is not a result ({type(error).__name__}: {error})") from error
-
-
 def _method(experiment: Any) -> str:
     return str(experiment.method)
-
-
-def results_in(path: Path, result: Callable[[str], Outcome]) -> list[Outcome]:
-    """Return the results in a file; lines that can't be read are left out."""
-    if not path.exists():
-        return []
-    found = []
-    with path.open(encoding="utf-8", errors="replace") as lines:
-        for line in lines:
-            try:
-                found.append(result(line))
-            except ValueError:  # an incomplete line, or a method that no longer exists
-                continue
-    return found
-
-
-def results_of_folders(folders: Iterable[str | Path], result: Callable[[str], Outcome], command: str) -> list[Outcome]:
-    """Return the results of all folders; when an experiment has several results, the last one counts.
-
-    Args:
-        folders: folders of results.
-        result: function that reads a line.
-        command: command that makes such a folder, for messages.
-
-    Raises:
-        InputError: when a folder does not exist or holds no results.
-    """
-    found: dict[Any, Outcome] = {}
-    for folder in map(Path, folders):
-        if not folder.is_dir():
-            raise InputError(f"{folder}: there is no such folder; '{command} --out {folder}' makes one")
-        here: list[Any] = [r for path in sorted(folder.glob(f"*{SUFFIX}")) for r in results_in(path, result)]
-        found.update({saved.experiment: saved for saved in here})
-        if not here:
-            raise InputError(f"{folder}: holds no results of '{command}'")
-    return list(found.values())

@@ -10,19 +10,17 @@ import math
 import time as clock
 import tracemalloc
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.benchmark import result_lines
 from imitarm.benchmark.controls import CONTROLS
 from imitarm.benchmark.provenance import code_version
-from imitarm.benchmark.result_lines import LineStore, results_in, results_of_folders
+from imitarm.benchmark.result_lines import ResultFormat
 from imitarm.benchmark.static_measures import MAX_ACCELERATION, MAX_SPEED, OUTCOMES, measure, outcome
 from imitarm.benchmark.static_scenes import FAMILIES, StaticCase, static_case
 from imitarm.errors import ImitarmError, InfeasibleError, InputError, UnknownNameError
@@ -35,8 +33,6 @@ from imitarm.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Options = tuple[tuple[str, float | str], ...]
-
-FORMAT = "imitarm-static-result 1"
 
 VARIANTS: Mapping[str, tuple[str, Options]] = {
     "acfra-literal": ("acfra", (("method", "literal"),)),
@@ -288,46 +284,5 @@ def _sawyer() -> ArmModel:
     return ArmModel.load("sawyer", tool="gripper")
 
 
-class ResultLines(LineStore[StaticExperiment, StaticResult]):
-    """The results of the static benchmark, see :class:`~imitarm.benchmark.result_lines.LineStore`."""
-
-    def line(self, outcome: StaticResult) -> str:
-        """Return a result as one line of JSON."""
-        return json_line(outcome)
-
-    def result(self, line: str) -> StaticResult:
-        """Return the result in a line.
-
-        Raises:
-            ValueError: when the line is not a result of this version.
-        """
-        return result_of(line)
-
-
-def json_line(result: StaticResult) -> str:
-    """Return a result as one line of JSON; null stands for nan."""
-    return result_lines.json_line(result, FORMAT)
-
-
-def result_of(line: str) -> StaticResult:
-    """Return the result in a line of JSON.
-
-    Raises:
-        ValueError: when the line is not JSON.
-        FileFormatError: when the line is not a result of this version.
-    """
-    return result_lines.from_json(line, FORMAT, StaticExperiment, StaticResult)
-
-
-def read_lines(path: Path) -> list[StaticResult]:
-    """Return the results in a file; lines that can't be read are left out."""
-    return results_in(path, result_of)
-
-
-def read_folders(folders: Iterable[str | Path]) -> list[StaticResult]:
-    """Return the results of all folders; when an experiment has several results, the last one counts.
-
-    Raises:
-        InputError: when a folder does not exist or holds no results.
-    """
-    return results_of_folders(folders, result_of, "imitarm benchmark static")
+RESULTS = ResultFormat("imitarm-static-result 1", StaticExperiment, StaticResult, "imitarm benchmark static")
+"""How results are written and read."""

@@ -47,7 +47,7 @@ examples:
   imitarm benchmark placements --skill pour.json shelf.json --robots sawyer panda --tool gripper --jobs 2
   imitarm benchmark placements --policies acfra rrt-connect --max-tilt 30 --out placements.jsonl
   imitarm benchmark comparison placements.jsonl
-  imitarm benchmark packing --seeds 100 --out packing.jsonl
+  imitarm benchmark packing --seeds 100 --out packing
   imitarm benchmark people recordings person.mp4
   imitarm benchmark refusals --scenes 1000
   imitarm benchmark static --count 100 --out static
@@ -134,7 +134,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     packed.add_argument(
         "--observer", choices=OBSERVERS, default="sensor", help="how box and bottle are observed; default: sensor"
     )
-    packed.add_argument("--out", type=Path, metavar="FILE", help="file for the results; an interrupted run continues")
+    packed.add_argument(
+        "--out",
+        type=Path,
+        default=Path("benchmark-packing"),
+        metavar="FOLDER",
+        help="folder for the results, in which an interrupted run continues; default: benchmark-packing",
+    )
     add_workers(packed)
     add_fill(packed)
     packed.set_defaults(benchmark=_packing)

@@ -9,7 +9,7 @@ from typing import Any
 
 from imitarm.benchmark.moving import WORLDS, MovingExperiment, default_methods, run_experiment
 from imitarm.benchmark.moving_arm import ROBOTS
-from imitarm.benchmark.moving_results import MovingLines, MovingResults, read_folders
+from imitarm.benchmark.moving_results import RESULTS, MovingResults
 from imitarm.benchmark.moving_scenes import FAMILIES
 from imitarm.benchmark.moving_tables import family_table, moving_tables, success_table
 from imitarm.benchmark.person_arm import DATA, has_recordings
@@ -114,7 +114,7 @@ def experiments_of(arguments: argparse.Namespace) -> list[MovingExperiment]:
 def _run(arguments: argparse.Namespace) -> int:
     """Run the experiments; print the rates of success."""
     wanted, workers = experiments_of(arguments), workers_of(arguments)
-    store = MovingLines(arguments.out, reuse=arguments.reuse)
+    store = RESULTS.store(arguments.out, reuse=arguments.reuse)
     done = run_with_progress("moving", wanted, run_experiment, store, workers, fresh=arguments.fresh)
     results = MovingResults(done.outcomes)
     for world in results.worlds:
@@ -129,7 +129,7 @@ def _compare(arguments: argparse.Namespace) -> int:
     """Print the tables of saved results, and write files."""
     place = place_of(arguments, "moving")
     check_outputs([("--report", arguments.report)], [("--fill", arguments.fill)], new_folders=True)
-    found = read_folders(arguments.folders)
+    found = RESULTS.read_folders(arguments.folders)
     results, versions = MovingResults(found), [r.code for r in found]
     if set(versions) != {code_version()}:
         remark(origin(versions))

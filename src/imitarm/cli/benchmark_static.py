@@ -12,15 +12,7 @@ from typing import Any
 from imitarm.benchmark.experiment import plain, write_text
 from imitarm.benchmark.provenance import code_version, origin
 from imitarm.benchmark.running import run_experiments
-from imitarm.benchmark.static import (
-    ResultLines,
-    StaticExperiment,
-    StaticResult,
-    method_names,
-    policy_class,
-    read_folders,
-    run_experiment,
-)
+from imitarm.benchmark.static import RESULTS, StaticExperiment, StaticResult, method_names, policy_class, run_experiment
 from imitarm.benchmark.static_claims import cost_law, static_tables
 from imitarm.benchmark.static_scaling import scaling_tables
 from imitarm.benchmark.static_scenes import FAMILIES, SPLITS
@@ -169,7 +161,7 @@ def experiments_of(arguments: argparse.Namespace) -> list[StaticExperiment]:
 def _run(arguments: argparse.Namespace) -> int:
     """Run the experiments; print the rates of success, the speed, and how the time depends on the obstacles."""
     wanted, workers = experiments_of(arguments), workers_of(arguments)
-    store = ResultLines(arguments.out, reuse=arguments.reuse)
+    store = RESULTS.store(arguments.out, reuse=arguments.reuse)
     done = run_with_progress("planning", wanted, run_experiment, store, workers, fresh=arguments.fresh)
     results = StaticResults(done.outcomes)
     report_tables([success_table(results)], None, [code_version()])
@@ -189,7 +181,7 @@ def _tune(arguments: argparse.Namespace) -> int:
         remark("the scenes are not validation scenes: options that are tuned on test scenes must not be tested on them")
     search = Search(tuple(scenes), arguments.draws)
     methods = arguments.methods or [m for m in method_names() if len(search.options(m)) > 1]
-    store = ResultLines(arguments.out, reuse=arguments.reuse)
+    store = RESULTS.store(arguments.out, reuse=arguments.reuse)
     path: Path = arguments.save or arguments.out / "tuned.json"
     log = arguments.out / "draws.json-lines"
     with progress_bar() as bar:
@@ -232,7 +224,7 @@ def _scaling(arguments: argparse.Namespace) -> int:
 def _refusals(arguments: argparse.Namespace) -> int:
     """Run the default method, check its refusals with the oracle, and print the counts for each family."""
     place, workers = place_of(arguments, "static refusals"), workers_of(arguments)
-    store = ResultLines(arguments.out, reuse=arguments.reuse)
+    store = RESULTS.store(arguments.out, reuse=arguments.reuse)
     wanted = [StaticExperiment(*scene, OURS) for scene in _scenes(arguments)]
     done: list[StaticResult] = []
     with progress_bar() as bar:
@@ -257,7 +249,7 @@ def _compare(arguments: argparse.Namespace) -> int:
     place = place_of(arguments, "static")
     outputs = [("--report", arguments.report), ("--json", arguments.json), ("--markdown", arguments.markdown)]
     check_outputs([outputs[0]], [("--fill", arguments.fill), *outputs[1:]], new_folders=True)
-    found = read_folders(arguments.folders)
+    found = RESULTS.read_folders(arguments.folders)
     results, versions = StaticResults(found), [r.code for r in found]
     tables = static_tables(results)
     if set(versions) != {code_version()}:
