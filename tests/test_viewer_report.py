@@ -10,6 +10,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from imitarm import ArmModel
@@ -17,6 +18,7 @@ from imitarm.demonstrations import Finding
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.scene import Scene, Sphere
 from imitarm.viewer import Report, report, report_html, write_report
+from imitarm.viewer.recording import Prediction
 from viewer_samples import make_learning, make_recording, make_report, make_result
 
 VOID = {"meta", "link", "br", "img", "input", "hr"}
@@ -224,3 +226,15 @@ def test_a_plan_of_the_whole_arm_is_not_described_as_one_sphere() -> None:
     text = Page(report_html(replace(make_report(scenes=1), scenes=[result]))).text
     assert "one sphere" not in text
     assert f"{len(arm.cover.radii)} spheres, which contain every moving part of the arm" in text
+
+
+def test_the_legend_names_only_what_is_drawn() -> None:
+    recording = make_recording(seconds=0.2)
+    planned = {key.label for key in report._keys(make_result(recording=recording))}
+    assert "adapted path" in planned and not any("predicted" in label for label in planned)
+    n = len(recording)
+    ball = Prediction("ball", np.zeros((n, 3)), np.zeros((n, 3, 3)), np.full(3, 0.1))
+    tracked = make_result(recording=replace(recording, predictions=(ball,)), adaptation=None)
+    seen = {key.label for key in report._keys(tracked)}
+    assert any("predicted" in label for label in seen) and {"learned path", "measured path of the tool"} < seen
+    assert not any("component" in label or "adapted" in label for label in seen)

@@ -196,9 +196,13 @@ def _playback(scene: SceneResult) -> str:
 
 
 def _keys(scene: SceneResult) -> tuple[Key, ...]:
-    """Return the legend of the 3-D playback; predictions are in it only if an obstacle was tracked."""
-    tracked = scene.recording is not None and scene.recording.predictions
-    return _KEYS if tracked else _KEYS[:-1]
+    """Return the legend of the 3-D playback: only what is drawn in this scene."""
+    absent = set()
+    if scene.recording is None or not scene.recording.predictions:
+        absent.add(palette.PREDICTED)
+    if scene.adaptation is None:
+        absent |= {palette.ADAPTED, palette.UNMOVED, palette.MOVED}
+    return tuple(key for key in _KEYS if key.colour not in absent)
 
 
 def _scene_figures(key: str, scene: SceneResult) -> Iterator[Figure]:
