@@ -6,6 +6,8 @@ JOBS   ?= 2
 # `make MEDIAPIPE= unit` goes without; the tests of real video are skipped then
 MEDIAPIPE ?= mediapipe
 VIDEOS := .cache/pose2sim
+# compiled where there is a C compiler; without one, NumPy does the same
+KERNELS := $(wildcard src/imitarm/compiled/*.[ch])
 export MPLBACKEND = Agg
 # one thread for each numerical library: this work is many small matrices, and the tests already run side by side
 export OMP_NUM_THREADS ?= 1
@@ -19,7 +21,7 @@ help:  ## list the tasks
 demo: $(VENV)/.report  ## learn a sweep from demonstrations, do it around obstacles, write demo/report.html
 	$(BIN)/imitarm demo --force
 
-install: $(VENV)/.dev  ## the development environment in .venv
+install: $(VENV)/.dev $(VENV)/.compiled  ## the development environment in .venv
 
 test: lint types floors unit  ## everything CI runs
 
@@ -33,10 +35,10 @@ types: $(VENV)/.dev  ## strict types of src
 floors: $(VENV)/.dev  ## no import goes up
 	$(BIN)/lint-imports
 
-unit: $(VENV)/.dev $(MEDIAPIPE)  ## the tests
+unit: $(VENV)/.dev $(VENV)/.compiled $(MEDIAPIPE)  ## the tests
 	$(BIN)/pytest -n $(JOBS) --dist loadgroup
 
-quick: $(VENV)/.dev  ## the tests that your changes touch, the nearest first, in under a minute
+quick: $(VENV)/.dev $(VENV)/.compiled  ## the tests that your changes touch, the nearest first, in under a minute
 	$(BIN)/python tests/quick.py
 
 mediapipe: .venv-mediapipe/imitarm-mediapipe.txt $(VIDEOS)/cam04.mp4  ## video and webcam: MediaPipe's own environment, and real video for the tests
@@ -45,7 +47,7 @@ format: $(VENV)/.dev  ## fix what can be fixed mechanically
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: $(VENV)/.bench  ## speed against installed peers, as ratios
+bench: $(VENV)/.bench $(VENV)/.compiled  ## speed against installed peers, as ratios
 	$(BIN)/python benchmarks/speed.py
 
 DATA ?= ../shared/data
@@ -84,11 +86,15 @@ $(BIN)/python:
 
 $(VENV)/.report: $(BIN)/python pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable '.[report]'
+	$(BIN)/python -m imitarm.compiled
 	@touch $@
 
 $(VENV)/.dev: $(BIN)/python pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
-	-$(BIN)/python -c 'from imitarm.perception import build_track_kernel; print(build_track_kernel())'
+	@touch $@
+
+$(VENV)/.compiled: $(KERNELS) | $(VENV)/.dev
+	$(BIN)/python -m imitarm.compiled
 	@touch $@
 
 $(VENV)/.bench: $(VENV)/.dev pyproject.toml

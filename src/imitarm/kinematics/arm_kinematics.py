@@ -6,7 +6,7 @@ import math
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -81,6 +81,8 @@ class ArmMemory:
         sites: positions of the sites in the base frame, shape (nsite, 3) [m].
         force: generalised forces, shape (nv,).
         centers: centres of the spheres that cover the arm, once they have been computed for the posture.
+        n_joints: number of the arm's joints.
+        kept: arrays that compiled code uses again in every step, by name.
     """
 
     def __init__(
@@ -102,7 +104,9 @@ class ArmMemory:
         self.linear, self.angular = self.jacobian[:3], self.jacobian[3:]
         self.force = np.zeros(model.nv)
         self.centers: Array | None = None
+        self.kept: dict[str, Any] = {}
         self._model, self._positions, self._joints, self._posture = model, positions, joints, b""
+        self.n_joints = self.data.qpos[positions].size
         stacked = np.zeros((len(landmarks), 3, model.nv))
         self._stacked = stacked.reshape(-1, model.nv)
         # Views, where the joints are side by side: creating them again takes as long as the computation itself.

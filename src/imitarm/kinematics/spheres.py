@@ -34,6 +34,8 @@ class SphereCover:
         carriers: index of the body that each joint moves, shape (n_joints,).
         slides: True for prismatic joints, shape (n_joints,).
         moves: 1.0 where a joint moves a sphere, else 0.0, shape (m, n_joints).
+        dofs: index of each joint's velocity in the model, shape (n_joints,).
+        root: body about whose centre of mass MuJoCo gives the twists of the joints.
     """
 
     def __init__(self, model: mujoco.MjModel, working: mujoco.MjModel, names: Sequence[str]) -> None:
@@ -78,8 +80,8 @@ class SphereCover:
         self.moves = self._moves[:, 0]
         self.moves.setflags(write=False)
         self.carriers = working.jnt_bodyid[self.joints].astype(int)
-        self._root = int(model.body_rootid[model.jnt_bodyid[joints[0]]])
-        self._dofs = working.jnt_dofadr[self.joints]
+        self.root = int(model.body_rootid[model.jnt_bodyid[joints[0]]])
+        self.dofs = working.jnt_dofadr[self.joints]
         self._moved = self._moves[:, 0].copy()
         self.links = self._moves[:, 0].sum(axis=1).astype(int)
         self.follows_last_joint = self._moves[:, 0, -1] > 0.0
@@ -116,7 +118,7 @@ class SphereCover:
             centers: centers of these spheres, shape (3, k) [m].
             normals: the directions, unit vectors, shape (3, k).
         """
-        a, b, c = centers - data.subtree_com[self._root][:, None]
+        a, b, c = centers - data.subtree_com[self.root][:, None]
         x, y, z = normals
         wrenches = np.empty((6, len(spheres)))
         for row, left, right in zip(wrenches, (b, c, a), (z, x, y), strict=False):
@@ -124,7 +126,7 @@ class SphereCover:
         for row, left, right in zip(wrenches, (c, a, b), (y, z, x), strict=False):
             np.subtract(row, left * right, out=row)
         wrenches[3:] = normals
-        speeds = np.dot(wrenches.T, data.cdof.take(self._dofs, axis=0).T)
+        speeds = np.dot(wrenches.T, data.cdof.take(self.dofs, axis=0).T)
         speeds *= self._moved.take(spheres, axis=0)
         return speeds
 

@@ -16,7 +16,6 @@ from imitarm.perception.segmentation import fit_plane
 from imitarm.perception.self_filter import SelfFilter
 from imitarm.perception.shape_choice import SHAPES
 from imitarm.perception.target import Target
-from imitarm.perception.track_kernel import build as build_track_kernel
 from imitarm.perception.tracker import ObstacleTracker
 from imitarm.perception.tracks import TrackedObstacle
 
@@ -37,6 +36,5 @@ __all__ = [
     "Target",
     "TrackedObstacle",
     "assign",
-    "build_track_kernel",
     "fit_plane",
 ]

@@ -1,59 +1,15 @@
-"""The update of all tracks as compiled code, where it has been built; NumPy computes the same without it.
-
-:func:`build` compiles ``track_kernel.c`` with the C compiler of the machine and puts the result beside it. Nothing else
-needs a compiler.
-"""
+"""The update of all tracks as compiled code, where it has been built; NumPy computes the same without it."""
 
 from __future__ import annotations
-
-import ctypes
-import shutil
-import subprocess
-from functools import cache
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imitarm.compiled import library
+from imitarm.compiled.kernels import address
+
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
-
-SOURCE = Path(__file__).with_suffix(".c")
-LIBRARY = SOURCE.with_suffix(".compiled")
-_VERSION = 1
-_COMPILERS = ("cc", "gcc", "clang")
-
-
-def build() -> str:
-    """Compile the kernel; return a sentence that says what was done."""
-    compiler = next((path for name in _COMPILERS if (path := shutil.which(name))), None)
-    if compiler is None:
-        return "no C compiler was found; the tracker uses NumPy"
-    made = LIBRARY.with_suffix(".new")
-    command = [compiler, "-O2", "-ffp-contract=off", "-shared", "-fPIC", "-o", str(made), str(SOURCE), "-lm"]
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
-    if done.returncode != 0:
-        return f"{Path(compiler).name} failed; the tracker uses NumPy:\n{done.stderr}"
-    made.replace(LIBRARY)
-    return f"built {LIBRARY.name}"
-
-
-@cache
-def library() -> Any:
-    """Return the compiled library; None if it was not built, or for another version."""
-    try:
-        found = ctypes.CDLL(str(LIBRARY))
-        found.track_kernel_version.restype = ctypes.c_int64
-        if found.track_kernel_version() != _VERSION:
-            return None
-        update = found.track_kernel_update
-    except (OSError, AttributeError):
-        return None
-    integer, pointer, number = ctypes.c_int64, ctypes.c_void_p, ctypes.c_double
-    update.argtypes = [*[integer] * 3, *[number] * 4, *[pointer] * 4]
-    update.restype = integer
-    return found
 
 
 def updated(
@@ -66,7 +22,7 @@ def updated(
     gate: float,
     max_speed: float,
 ) -> tuple[Array, Array, Indices, Array] | None:
-    """Predict and update all tracks; None if the kernel was not built, or if the assignment is not obvious.
+    """Predict and update all tracks; None without compiled code, or if the assignment is not obvious.
 
     Args:
         mean: states of n tracks, shape (n, 1, s).
@@ -91,7 +47,7 @@ def updated(
     x[:] = mean
     P[:] = covariance
     indices = np.empty(n + len(rows), dtype=np.int64)
-    places = [array.__array_interface__["data"][0] for array in (states, rows, first, indices)]
+    places = [address(array) for array in (states, rows, first, indices)]
     if kernel.track_kernel_update(n, len(rows), s, dt, noise, gate, max_speed, *places):
         return None
     return x, P, indices[:n], states[-n:]

@@ -258,12 +258,12 @@ class PairsOfLinks(Pairs):
 
     def __init__(self, arm: ArmModel, own: SelfClearance) -> None:
         self.arm, self.obstacle = arm, SELF
-        self.sphere, self.other = own.outer, own.inner
-        self.first = own.links[own.inner]
-        self.moves = (arm.cover.moves[own.outer] > 0.0) & (np.arange(arm.n_joints) >= self.first[:, None])
-        self._kept_off = own.sums + own.clearance
+        self.sphere, self.other = own.pairs.outer, own.pairs.inner
+        self.first = own.links[own.pairs.inner]
+        self.moves = (arm.cover.moves[own.pairs.outer] > 0.0) & (np.arange(arm.n_joints) >= self.first[:, None])
+        self._kept_off = own.pairs.sums + own.clearance
         self._coarsely = (self._kept_off + _ROUNDING).astype(np.float32)
-        kinds, group = np.unique(arm.cover.links[own.outer] * 64 + self.first, return_inverse=True)
+        kinds, group = np.unique(arm.cover.links[own.pairs.outer] * 64 + self.first, return_inverse=True)
         self.group = group.reshape(-1)
         self._of_groups = kinds // 64 - 1, kinds % 64
 

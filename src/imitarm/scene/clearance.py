@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik_problem import Rows
 from imitarm.kinematics.spheres import COLLISION_GROUP
+from imitarm.scene.arm_rows import OwnRows, SpherePairs
 from imitarm.validation import finite_number, instance, whole_number
 
 Array = NDArray[np.float64]
@@ -77,14 +78,9 @@ class SelfClearance:
         outer, inner = np.nonzero(meet[links[:, None], links] & (apart >= clearance))
         pair_of_links = links[outer] * (arm.n_joints + 1) + links[inner]
         order = np.argsort(pair_of_links, kind="stable")
-        self.outer, self.inner = outer[order], inner[order]
-        self._flat = self.outer * len(radii) + self.inner  # in the matrix of all distances
-        self.sums = sums[self.outer, self.inner]
-        self._coarse_sums = self.sums.astype(np.float32)
-        self._starts = np.flatnonzero(np.diff(pair_of_links[order], prepend=-1))
-        ends = [*self._starts.tolist(), len(order)][1:]
-        self._groups = [slice(a, b) for a, b in zip(self._starts.tolist(), ends, strict=True)]
-        self._near, self._close = np.float32(clearance + _INFLUENCE), np.float32(clearance + _NEAR)
+        starts = np.flatnonzero(np.diff(pair_of_links[order], prepend=-1))
+        self.pairs = SpherePairs(outer[order], inner[order], (radii[outer] + radii[inner])[order], starts)
+        self._near, self._close = clearance + _INFLUENCE, clearance + _NEAR
 
     def _centers(self, q: ArrayLike) -> Array:
         """Return the centres of all spheres, with the base's spheres last, shape (m, 3) [m]."""
@@ -93,7 +89,7 @@ class SelfClearance:
     @property
     def n_pairs(self) -> int:
         """Number of pairs of spheres that are checked."""
-        return len(self.sums)
+        return len(self.pairs.sums)
 
     def distance(self, q: ArrayLike) -> float:
         """Return the smallest distance of all checked pairs of spheres [m]; negative when two overlap.
@@ -106,8 +102,7 @@ class SelfClearance:
         """
         if not self.n_pairs:
             return math.inf
-        centers = self._centers(q)
-        return float((np.linalg.norm(centers[self.outer] - centers[self.inner], axis=1) - self.sums).min())
+        return float(self.pairs.distances(self._centers(q)).min())
 
     def nearest(self, q: ArrayLike) -> tuple[Indices, Array]:
         """Return the pairs of spheres that are near enough to have a row in :meth:`rows`, nearest pair first.
@@ -118,8 +113,9 @@ class SelfClearance:
         Returns:
             indices of the two spheres (k, 2), and their distances (k,) [m].
         """
-        outer, inner, _, _, distances = self._found(q)
-        return np.stack((outer, inner), axis=1), distances
+        found = self._found(q)
+        pairs = np.stack((self.pairs.outer.take(found.pair), self.pairs.inner.take(found.pair)), axis=1)
+        return pairs, found.distance
 
     def names_of(self, q: ArrayLike, row: int) -> tuple[str, str, float]:
         """Return the names of the two links of a row of :meth:`rows`, and their distance minus the clearance [m].
@@ -154,11 +150,8 @@ class SelfClearance:
         Returns:
             None when nothing is near.
         """
-        outer, inner, centers, normals, distances = self._found(q)
-        if not len(outer):
-            return None
-        gradients = self.arm.cover.parting(self.arm.at(q).data, outer, inner, centers, normals)
-        return gradients, distances - self.clearance
+        _, distance, gradient = self._found(q)
+        return (gradient, distance - self.clearance) if len(distance) else None
 
     def lower(self, room: Array) -> Array:
         """Return the least allowed rates (k,) [m/s] of distances; ``room`` (k,) [m] is distance minus clearance."""
@@ -170,41 +163,10 @@ class SelfClearance:
         """Return a version of this check that takes a fifth of its time, for a control loop with period ``dt`` [s]."""
         return PeriodicSelfClearance(self, dt)
 
-    def _found(self, q: ArrayLike) -> tuple[Indices, Indices, Array, Array, Array]:
-        """Return the nearest pairs: outer and inner spheres, centres of the outer spheres, normals and distances."""
-        centers = self._centers(q)
-        chosen = np.zeros(0, dtype=np.intp)
-        if self._groups:
-            best: list[int] = []
-            coarse = self._coarse_distances(centers)
-            least = np.minimum.reduceat(coarse, self._starts)
-            for group in least.argsort()[: self._n_rows].tolist():
-                if least[group] < self._near:
-                    part = self._groups[group]
-                    best.append(part.start + int(coarse[part].argmin()))
-            close = (coarse < self._close).nonzero()[0]
-            if len(close) > _MOST:
-                close = close[np.argpartition(coarse[close], _MOST)[:_MOST]]
-            chosen = np.array(sorted({*close.tolist(), *best}), dtype=np.intp)
-            chosen = chosen.take(coarse.take(chosen).argsort())
-        outer, inner = self.outer.take(chosen), self.inner.take(chosen)
-        outer_centers = centers.take(outer, axis=0)
-        between = outer_centers - centers.take(inner, axis=0)
-        lengths = np.sqrt((between * between).sum(axis=1))
-        return outer, inner, outer_centers, between / lengths[:, None], lengths - self.sums.take(chosen)
-
-    def _coarse_distances(self, centers: Array) -> NDArray[np.float32]:
-        """Return the distances of all checked pairs in single precision, which suffices for finding near pairs."""
-        points = centers.astype(np.float32)
-        squares = (points * points).sum(axis=1)
-        products = points @ (-2.0 * points).T
-        products += squares
-        products += squares[:, None]
-        distances = products.ravel().take(self._flat)
-        np.maximum(distances, 0.0, out=distances)
-        np.sqrt(distances, out=distances)
-        distances -= self._coarse_sums
-        return distances
+    def _found(self, q: ArrayLike) -> OwnRows:
+        """Return the nearest pairs."""
+        memory, centers = self.arm.at(q), self._centers(q)
+        return self.pairs.rows(self.arm.cover, memory, centers, self._n_rows, self._near, self._close, _MOST)
 
 
 class PeriodicSelfClearance:

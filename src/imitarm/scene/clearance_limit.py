@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik_problem import Box, Rows
+from imitarm.scene.arm_rows import obstacle_rows
 from imitarm.scene.braking import APPROACH_RATE, LONGEST_YIELD, shrink_rates
-from imitarm.scene.distances import PackedObstacles, near_pairs
+from imitarm.scene.distances import PackedObstacles
 from imitarm.scene.scene import Scene
 from imitarm.validation import finite_number, instance
 
@@ -137,24 +138,19 @@ class ClearanceLimit:
         packed = scene.packed
         if not len(packed):
             return None
-        data, centers = self.arm.at(q).data, self.arm.sphere_centers(q)
-        pairs = near_pairs(packed, centers, self._reach(packed, margins))
-        if pairs is None:
+        memory, centers = self.arm.at(q), self.arm.sphere_centers(q)
+        found = obstacle_rows(self._cover, memory, packed, centers, self._reach(packed, margins))
+        obstacle, sphere, distance, approach, variance, matrix = found
+        if not len(obstacle):
             return None
-        obstacle, sphere, distance, normal = pairs
-        points = centers.take(sphere, axis=0).T
-        matrix = self._cover.speeds(data, sphere, points, normal)
         room = distance - self._reduced.take(sphere)
         if margins is not None:
             room -= margins.take(obstacle)
-        if self.deviations and packed.covariances.any():
-            spread = np.einsum("ik,kij,jk->k", normal, packed.covariances.take(obstacle, axis=0), normal)
-            room -= self.deviations * np.sqrt(np.maximum(spread, 0.0))
-        approach = _approach(packed, obstacle, points, normal)
+        if self.deviations:
+            room -= self.deviations * np.sqrt(np.maximum(variance, 0.0))
         speed = None if velocity is None else np.asarray(velocity, dtype=float)
-        return self._rows(
-            scene, matrix, _Pairs(obstacle, sphere, room, approach), speed, self._free if box is None else box
-        )
+        pairs = _Pairs(obstacle, sphere, room, None if packed.still else approach)
+        return self._rows(scene, matrix, pairs, speed, self._free if box is None else box)
 
     def _reach(self, packed: PackedObstacles, margins: Array | None) -> Array:
         """Return the distance of each sphere's centre within which obstacles have rows; the same array if possible."""
@@ -220,14 +216,3 @@ def violable(matrix: Array, lower: Array, box: Box) -> NDArray[np.bool_]:
     """Return for each row ``matrix @ v >= lower`` whether any velocity v in a box violates it, shape (k,)."""
     middle, half = 0.5 * (box.lower + box.upper), 0.5 * (box.upper - box.lower)
     return np.asarray(lower > matrix.dot(middle) - np.abs(matrix).dot(half))
-
-
-def _approach(packed: PackedObstacles, obstacle: Indices, points: Array, normal: Array) -> Array | None:
-    """Return the speed of each obstacle's nearest point along the normal, shape (k,) [m/s]; None if none moves."""
-    if packed.still:
-        return None
-    velocity = packed.velocities.take(obstacle, axis=0).T
-    if packed.rotating:  # the nearest surface point p moves at v + w x (p - origin); c - p is along n
-        arms = points - packed.positions.take(obstacle, axis=0).T
-        velocity = velocity + np.cross(packed.angular_velocities.take(obstacle, axis=0).T, arms, axis=0)
-    return np.asarray(np.einsum("ij,ij->j", velocity, normal))

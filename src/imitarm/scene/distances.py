@@ -38,7 +38,7 @@ _ROWS = (
     "stamps",
     "track_ids",
 )
-_OF_THE_POSE = frozenset(("positions", "_frames", "_ahead", "_shapes"))
+_OF_THE_POSE = frozenset(("positions", "_frames", "_ahead", "_shapes", "_record"))
 
 
 class Members(NamedTuple):

@@ -1,7 +1,6 @@
 /* One update of all tracks, for the usual case: one model of motion, and no doubt about the assignment.
  *
- * The same computation as MotionFilter.predict, assign and MotionFilter.update, which are the reference.
- * Compiled by imitarm.perception.track_kernel.build(). */
+ * The same computation as MotionFilter.predict, assign and MotionFilter.update, which are the reference. */
 
 #include <math.h>
 #include <stdint.h>
@@ -9,8 +8,6 @@
 
 #define MAX_STATE 9
 #define ROW 15 /* position (3), covariance (9), size (3) */
-
-int64_t track_kernel_version(void) { return 1; }
 
 static double trace(const double *matrix, int64_t stride) { return matrix[0] + matrix[stride + 1] + matrix[2 * stride + 2]; }
 

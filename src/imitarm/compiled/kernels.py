@@ -1,0 +1,101 @@
+"""Building and loading the library of compiled code."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import shutil
+import subprocess
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FOLDER = Path(__file__).parent
+LIBRARY = FOLDER / "kernels.compiled"
+_COMPILERS = ("cc", "gcc", "clang")
+# without contraction and reordering, the order of all roundings is that of the source
+_OPTIONS = ("-O2", "-std=c11", "-ffp-contract=off", "-shared", "-fPIC")
+_I, _P, _D = ctypes.c_int64, ctypes.c_void_p, ctypes.c_double
+_FUNCTIONS: dict[str, tuple[Any, ...]] = {
+    "imitarm_sources": (),
+    "obstacle_rows": (_P, _D, _P, _P, _P, _P, _P, _P),
+    "self_rows": (_P, _P, _P, _I, _D, _D, _I, _P, _P, _P, _P),
+    "track_kernel_update": (_I, _I, _I, _D, _D, _D, _D, _P, _P, _P, _P),
+}
+
+
+def build() -> str:
+    """Compile all sources; return a sentence that says what was done."""
+    compiler = next((path for name in _COMPILERS if (path := shutil.which(name))), None)
+    if compiler is None:
+        return "no C compiler was found; NumPy is used"
+    made = LIBRARY.with_suffix(".new")
+    sources = [str(path) for path in sorted(FOLDER.glob("*.c"))]
+    command = [compiler, *_OPTIONS, f"-DIMITARM_SOURCES={_of_the_sources()}", "-o", str(made), *sources, "-lm"]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    if done.returncode != 0:
+        return f"{Path(compiler).name} failed; NumPy is used:\n{done.stderr}"
+    made.replace(LIBRARY)
+    library.cache_clear()
+    return f"built {LIBRARY.name}"
+
+
+@cache
+def library() -> Any:
+    """Return the compiled library; None if it was not built, or was built from other sources."""
+    try:
+        found = ctypes.CDLL(str(LIBRARY))
+        for name, arguments in _FUNCTIONS.items():
+            function = getattr(found, name)
+            function.argtypes, function.restype = arguments, _I
+        return found if found.imitarm_sources() == _of_the_sources() else None
+    except (OSError, AttributeError):
+        return None
+
+
+def address(array: NDArray[Any]) -> int:
+    """Return the address of an array's memory; the array must be kept as long as the address is used."""
+    place: int = array.__array_interface__["data"][0]
+    return place
+
+
+class Record:
+    """A C structure whose fields are whole numbers of 64 bits, addresses of arrays, and lists of addresses of records.
+
+    The record keeps its fields. A copy in another process has addresses of its own.
+
+    Attributes:
+        address: address of the structure.
+    """
+
+    def __init__(self, *fields: int | NDArray[Any] | Sequence[Record | None]) -> None:
+        """Write the fields in order; an array of another type or layout than C has must not be given."""
+        self._fields = fields
+        values: list[int] = []
+        self._lists: list[NDArray[np.int64]] = []
+        for field in fields:
+            if isinstance(field, int):
+                values.append(field)
+            elif isinstance(field, np.ndarray):
+                values.append(address(field))
+            else:
+                places = np.array([0 if record is None else record.address for record in field], dtype=np.int64)
+                self._lists.append(places)
+                values.append(address(places))
+        self._memory = np.array(values, dtype=np.int64)
+        self.address: int = address(self._memory)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Record, self._fields
+
+
+def _of_the_sources() -> int:
+    """Return a number that changes with every change of the sources."""
+    known = hashlib.sha256()
+    for path in sorted([*FOLDER.glob("*.c"), *FOLDER.glob("*.h")]):
+        known.update(path.read_bytes())
+    return int.from_bytes(known.digest()[:7], "big")

@@ -1,0 +1,68 @@
+"""Building and loading compiled code: nothing needs it, and a library of other sources is not used."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+
+from compiled_code import compiled, library_at  # noqa: F401  a fixture
+from imitarm.compiled import build, kernels, library
+from imitarm.compiled.kernels import Record, address
+from imitarm.perception import Detection, ObstacleTracker
+from imitarm.scene import Sphere
+
+needs_compiler = pytest.mark.skipif(
+    not any(shutil.which(name) for name in ("cc", "gcc", "clang")), reason="no C compiler"
+)
+
+
+def test_without_a_compiler_or_a_library_numpy_is_used(tmp_path, monkeypatch):
+    with library_at(tmp_path / "kernels.compiled"):
+        monkeypatch.setattr(shutil, "which", lambda _: None)
+        assert "NumPy is used" in build()
+        assert library() is None
+        (tmp_path / "kernels.compiled").write_text("no library")
+        library.cache_clear()
+        assert library() is None
+        tracker = ObstacleTracker()
+        for k in range(3):
+            tracker.update(k / 30.0, [Detection(Sphere(np.zeros(3), 0.1), 1e-4 * np.eye(3))])
+        assert len(tracker.tracks) == 1
+
+
+@needs_compiler
+def test_a_failing_compiler_is_reported(tmp_path, monkeypatch):
+    (tmp_path / "wrong.c").write_text("this is not C")
+    monkeypatch.setattr(kernels, "FOLDER", tmp_path)
+    with library_at(tmp_path / "kernels.compiled"):
+        assert "failed; NumPy is used" in build()
+        assert library() is None
+    assert not (tmp_path / "kernels.compiled").exists()
+
+
+@needs_compiler
+def test_a_library_of_other_sources_is_not_used(tmp_path, monkeypatch):
+    with library_at(tmp_path / "kernels.compiled"):
+        assert build() == "built kernels.compiled"
+        assert library() is not None
+        monkeypatch.setattr(kernels, "_of_the_sources", lambda: 0)
+        library.cache_clear()
+        assert library() is None
+
+
+@needs_compiler
+def test_the_sources_compile_without_a_warning(tmp_path, monkeypatch):
+    monkeypatch.setattr(kernels, "_OPTIONS", (*kernels._OPTIONS, "-Wall", "-Wextra", "-Werror"))
+    with library_at(tmp_path / "kernels.compiled"):
+        assert build() == "built kernels.compiled"
+
+
+def test_a_record_has_the_layout_of_a_structure():
+    numbers, inner = np.arange(3.0), Record(7)
+    record = Record(5, numbers, [inner, None])
+    five, place, places = record._memory.tolist()
+    assert (five, place) == (5, address(numbers))
+    assert record._lists[0].tolist() == [inner.address, 0]
+    assert places == address(record._lists[0])
