@@ -88,7 +88,8 @@ def test_every_near_pair_has_its_row(arm, seed, spin):
     limit = ClearanceLimit(arm, 0.02, influence=3.0)
     rows, expected = limit.rows(q, scene, qd), all_rows(arm, q, scene, limit, qd)
     assert len(expected[1]) > 10
-    np.testing.assert_allclose(sorted_rows(rows.matrix, rows.lower), sorted_rows(*expected), atol=1e-8)
+    # the normals of ellipsoids have errors of 1e-6
+    np.testing.assert_allclose(sorted_rows(rows.matrix, rows.lower), sorted_rows(*expected), atol=1e-6)
 
 
 def test_rows_beyond_the_influence_do_not_matter_at_the_speeds_of_people_and_carts(arm):
