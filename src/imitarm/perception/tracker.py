@@ -15,8 +15,7 @@ from imitarm.kinematics.pose import Pose
 from imitarm.perception.association import NO_PAIRS, Pairs, assign, duplicates, matching_labels
 from imitarm.perception.consistency import Consistency, chi_square_quantile
 from imitarm.perception.detection import Detection
-from imitarm.perception.motion_filter import Belief, Measurements, MotionFilter
-from imitarm.perception.track_kernel import updated
+from imitarm.perception.motion_filter import Belief, Measurements, MotionFilter, updated
 from imitarm.perception.tracks import UNCONFIRMED, TrackedObstacle, Tracks, smoothed_sizes
 from imitarm.scene import Obstacle, Scene
 from imitarm.validation import finite_number, sequence, whole_number

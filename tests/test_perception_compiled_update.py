@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from compiled_code import compiled  # noqa: F401  a fixture
 from imitarm.perception import Detection, ObstacleTracker
-from imitarm.perception.motion_filter import MotionFilter
-from imitarm.perception.track_kernel import updated
+from imitarm.perception.motion_filter import MotionFilter, updated
 from imitarm.scene import Sphere
 
 pytestmark = pytest.mark.usefixtures("compiled")
