@@ -16,6 +16,8 @@ from imitarm.benchmark.static import RESULTS, StaticExperiment, StaticResult, po
 from imitarm.benchmark.static_claims import claims_table, cost_law, static_tables
 from imitarm.benchmark.static_comparison import PRINTED, mcnemar, pairing, pairings, printed_table, signed_rank, task_of
 from imitarm.benchmark.static_scaling import Plan, exponent, plan_once, scaling_case
+from imitarm.benchmark.static_scenes import ANY_SKILL, learned_skill
+from imitarm.benchmark.static_skills import skills_table, teachers_table
 from imitarm.benchmark.static_tables import (
     StaticResults,
     checked_refusals_table,
@@ -24,7 +26,6 @@ from imitarm.benchmark.static_tables import (
     row_name,
     scenes_table,
     success_table,
-    teachers_table,
 )
 from imitarm.benchmark.static_tuning import Search, score, tune, write_tuned
 from imitarm.benchmark.tables import END
@@ -32,8 +33,8 @@ from imitarm.errors import FileFormatError, InputError
 from imitarm.tasks.sweep import NUMBERED_SCENES
 
 
-def result(method, seed, outcome, family="S1", dimension=2, teachers=1, options=(), **values):
-    experiment = StaticExperiment(family, dimension, seed, method, teachers, options)
+def result(method, seed, outcome, family="S1", dimension=2, teachers=1, options=(), skill="", **values):
+    experiment = StaticExperiment(family, dimension, seed, method, teachers, options, skill=skill)
     known = {"n_obstacles": 2, "must_refuse": None, "rmse": 0.05, "plan_cpu": 0.01, "plan_seconds": 0.01}
     return StaticResult(experiment, "commit 1", outcome, "", {**known, **values})
 
@@ -164,10 +165,30 @@ def test_tables_by_obstacles_and_teachers():
     ]
     results = StaticResults(found)
     row = rows_of(teachers_table(results))["acfra"]
-    assert row["1 teachers: success % (95 %)>"].startswith("50.0")
+    assert row["1 teacher: success % (95 %)>"].startswith("50.0")
     assert row["3 teachers: success % (95 %)>"].startswith("100.0")
     assert obstacles_table(results).columns == ("method", "2>")
     assert all(len(r) == len(t.columns) for t in static_tables(results) for r in t.rows)
+
+
+def test_scenes_with_skills_from_files_have_their_own_table():
+    found = [oracle(s, skill=skill) for s in range(4) for skill in ("a/pour.json", "b/draw.json")]
+    found += [oracle(9, "impossible", skill="a/pour.json"), result("acfra", 9, "refused", skill="a/pour.json")]
+    found += [
+        result("acfra", s, "success" if s or "b" in skill else "contact", skill=skill)
+        for s in range(4)
+        for skill in ("a/pour.json", "b/draw.json")
+    ]
+    rows = {row[:2]: row for row in skills_table(StaticResults(found)).rows}
+    assert rows["pour", "acfra"][2:4] == ("4", "75.0 (30.1 to 95.4)")
+    assert rows["pour", "acfra"][7] == "1 of 1"
+    assert rows["draw", "acfra"][3].startswith("100.0")
+    alone = StaticResults(found)
+    assert rows_of(scenes_table(alone))["all"]["scenes>"] == "9"
+    mixed = StaticResults([*found, oracle(0), result("acfra", 0, "success"), oracle(0, teachers=3)])
+    assert rows_of(scenes_table(mixed))["all"]["scenes>"] == "1"
+    assert "Skills from files" in [t.title for t in static_tables(mixed)]
+    assert all(len(r) == len(t.columns) for t in static_tables(mixed) for r in t.rows)
 
 
 def test_a_row_says_whether_its_options_are_tuned(monkeypatch):
@@ -360,6 +381,25 @@ def test_the_command_runs_resumes_compares_and_draws(tmp_path, capsys):
     assert text.count("<svg") >= 4 and "acfra-literal: S" in text
     assert cli.main(["benchmark", "static", "compare", str(out), "--report", str(page), "--play", "S1,2,1000"]) == 0
     assert "acfra: S1, 2-D, seed 1000" in page.read_text()
+
+
+def test_obstacles_can_be_placed_on_the_paths_of_skills_from_files(tmp_path, capsys):
+    file = tmp_path / "short.json"
+    reach = learned_skill("S1", 3)
+    reach.save(file)
+    out = tmp_path / "out"
+    words = ["benchmark", "static", "--first", "1000", "--count", "1", "--methods", "acfra", "oracle", "--jobs", "1"]
+    assert cli.main([*words, "--skill", str(file), "--out", str(out)]) == 0
+    found = RESULTS.read_folders([out])
+    assert len(found) == 4 * 2 * len(ANY_SKILL) / 2
+    assert {r.experiment.skill for r in found} == {str(file)}
+    capsys.readouterr()
+    assert cli.main(["benchmark", "static", "compare", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "Skills from files" in printed and "short" in printed
+    for more, said in ((["--families", "S4"], "choose from"), (["--teachers", "3"], "either --teachers or --skill")):
+        assert cli.main([*words, "--skill", str(file), *more]) == 2
+        assert said in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

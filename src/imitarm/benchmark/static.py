@@ -29,6 +29,7 @@ from imitarm.kinematics.arm_kinematics import find_posture
 from imitarm.kinematics.arm_path import track
 from imitarm.kinematics.pose import Pose
 from imitarm.policies import POLICIES, PathPlan, PathPolicy
+from imitarm.skills.skill import Skill
 from imitarm.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -95,6 +96,7 @@ class StaticExperiment:
         options: options that replace the defaults of the method, such as those found by tuning.
         torque: whether the torques of a Sawyer are computed as well, which takes most of the time.
         memory: whether the peak memory of a second, untimed plan is measured, which takes several times as long.
+        skill: file of the skill on whose path the obstacles stand; empty: the family's own skill.
 
     Raises:
         UnknownNameError: when family or method is not known.
@@ -109,6 +111,7 @@ class StaticExperiment:
     options: Options = ()
     torque: bool = False
     memory: bool = False
+    skill: str = ""
 
     def __post_init__(self) -> None:
         if self.family not in FAMILIES:
@@ -124,13 +127,18 @@ class StaticExperiment:
         object.__setattr__(self, "options", tuple(sorted((str(k), v) for k, v in self.options)))
 
     @property
-    def scene(self) -> tuple[str, int, int, int]:
+    def scene(self) -> tuple[str, int, int, int, str]:
         """What experiments of different methods in the same scene have in common."""
-        return self.family, self.dimension, self.seed, self.teachers
+        return self.family, self.dimension, self.seed, self.teachers, self.skill
 
     def case(self) -> StaticCase:
-        """Return the scene."""
-        return static_case(self.family, self.dimension, self.seed, teachers=self.teachers)
+        """Return the scene.
+
+        Raises:
+            InputError: when the file of the skill can't be read, or its path is too short for the obstacles.
+        """
+        skill = saved_skill(self.skill) if self.skill else None
+        return static_case(self.family, self.dimension, self.seed, teachers=self.teachers, skill=skill)
 
     def run(self) -> StaticResult:
         """Let the method plan in its scene, and measure the planned path.
@@ -228,12 +236,18 @@ class StaticResult:
         return math.nan if found is None else float(found)
 
 
+@lru_cache(maxsize=32)
+def saved_skill(path: str) -> Skill:
+    """Return the skill in a file, which is read once in each process."""
+    return Skill.load(path)
+
+
 _warm: set[tuple[str, int]] = set()  # method, and identity of the skill
 
 
 def _warm_up(method: str, case: StaticCase) -> None:
     """Let a method plan once without a clock in each process and for each skill, which imports and caches its parts."""
-    key = (method, id(case.skill))  # skills are kept, see learned_skill
+    key = (method, id(case.skill))  # skills are kept, see learned_skill and saved_skill
     if key in _warm or method in CONTROLS:
         return
     _warm.add(key)

@@ -17,6 +17,7 @@ from imitarm.benchmark.static_comparison import (
     task_of,
     times_table,
 )
+from imitarm.benchmark.static_skills import common_seeds, numbers_of_teachers, skills_table, teachers_table
 from imitarm.benchmark.static_tables import (
     IMPOSSIBLE,
     OURS,
@@ -30,7 +31,6 @@ from imitarm.benchmark.static_tables import (
     refusals_table,
     scenes_table,
     success_table,
-    teachers_table,
     time_table,
 )
 from imitarm.benchmark.tables import Table
@@ -195,12 +195,12 @@ def _local(results: StaticResults) -> Found:
 
 
 def _teachers(results: StaticResults) -> Found:
-    numbers = sorted({scene[3] for scene in results.by_scene})
+    numbers = numbers_of_teachers(results)
     if len(numbers) < 2:
         return _NOT_RUN
-    values = []
+    common, values = common_seeds(results), []
     for n in numbers:
-        found = results.of(OURS, lambda s, n=n: s[3] == n and results.solvable(s))  # type: ignore[misc]
+        found = results.of(OURS, lambda s, n=n: s[3] == n and not s[4] and s[:3] in common)  # type: ignore[misc]
         values.append((n, sum(map(is_success, found)), len(found)))
     if any(not of for *_, of in values):
         return _NOT_RUN
@@ -265,6 +265,8 @@ def static_tables(results: StaticResults) -> list[Table]:
         found += [printed_table(results), times_table(results)]
     found += [scenes_table(results), success_table(results), refusals_table(results), obstacles_table(results)]
     found += [success_table(results, families), quality_table(results), time_table(results), paired_table(results)]
-    if len({scene[3] for scene in results.by_scene}) > 1:
+    if len(numbers_of_teachers(results)) > 1:
         found.append(teachers_table(results))
+    if any(scene[4] for scene in results.by_scene):
+        found.append(skills_table(results))
     return [table for table in found if table.rows]

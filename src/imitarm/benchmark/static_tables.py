@@ -21,7 +21,7 @@ from imitarm.benchmark.tables import Table
 from imitarm.evaluation.intervals import wilson_interval
 
 Array = NDArray[np.float64]
-Scene = tuple[str, int, int, int]  # family, dimension, seed, number of teachers
+Scene = tuple[str, int, int, int, str]  # family, dimension, seed, number of teachers, file of the skill
 
 OURS = "acfra"
 ORACLE = "oracle"
@@ -105,9 +105,18 @@ class StaticResults:
         counts = [scene[3] for scene in self.by_scene]
         return max(set(counts), key=counts.count)
 
+    @cached_property
+    def only_files(self) -> bool:
+        """Whether the skills of all scenes come from files."""
+        return all(scene[4] for scene in self.by_scene)
+
     def usual(self, scene: Scene) -> bool:
-        """Return whether the skill of a scene was learned from the usual number of teachers."""
-        return scene[3] == self.main_teachers
+        """Return whether most tables count a scene.
+
+        Its skill must be learned from the usual number of teachers. Scenes with skills from files count only if there
+        are no others.
+        """
+        return scene[3] == self.main_teachers and (self.only_files or not scene[4])
 
 
 def is_success(result: StaticResult) -> bool:
@@ -407,22 +416,3 @@ def obstacles_table(results: StaticResults) -> Table:
         tuple(rows),
         "Scenes of all families that have a solution.",
     )
-
-
-def teachers_table(results: StaticResults) -> Table:
-    """Return a table of success and deviation by the number of teachers."""
-    teachers = sorted({scene[3] for scene in results.by_scene})
-    common = set.intersection(
-        *({s[:3] for s in results.by_scene if s[3] == n and results.solvable(s)} for n in teachers)
-    )
-    rows = []
-    for row in results.rows:
-        cells = []
-        for n in teachers:
-            found = results.of(row, lambda s, n=n: s[3] == n and s[:3] in common)  # type: ignore[misc]
-            good = [r for r in found if is_success(r)]
-            cells += [rate(len(good), len(found)), mean([r.value("rmse") for r in good], 1e3)]
-        rows.append((row, *cells))
-    columns = [c for n in teachers for c in (f"{n} teachers: success % (95 %)>", f"{n} teachers: RMSE [mm]>")]
-    note = f"{len(common)} seeds, for which the scenes of every number of teachers have a solution."
-    return Table("Number of teachers", ("method", *columns), tuple(rows), note)

@@ -12,10 +12,18 @@ from typing import Any
 from imitarm.benchmark.experiment import plain, write_text
 from imitarm.benchmark.provenance import code_version, origin
 from imitarm.benchmark.running import run_experiments
-from imitarm.benchmark.static import RESULTS, StaticExperiment, StaticResult, method_names, policy_class, run_experiment
+from imitarm.benchmark.static import (
+    RESULTS,
+    StaticExperiment,
+    StaticResult,
+    method_names,
+    policy_class,
+    run_experiment,
+    saved_skill,
+)
 from imitarm.benchmark.static_claims import cost_law, static_tables
 from imitarm.benchmark.static_scaling import scaling_tables
-from imitarm.benchmark.static_scenes import FAMILIES, SPLITS
+from imitarm.benchmark.static_scenes import ANY_SKILL, FAMILIES, SPLITS, static_case
 from imitarm.benchmark.static_tables import ORACLE, OURS, StaticResults, checked_refusals_table, success_table
 from imitarm.benchmark.static_tuning import DRAWS, Search, tune, tuned_options, write_tuned
 from imitarm.cli.benchmark_options import (
@@ -55,6 +63,13 @@ def add_static(parsers: Any) -> None:
         default=[1],
         metavar="N",
         help="teachers of the skills; default: 1",
+    )
+    static.add_argument(
+        "--skill",
+        nargs="+",
+        default=[],
+        metavar="FILE",
+        help=f"put the obstacles on the paths of these skills, in the families {' '.join(ANY_SKILL)}",
     )
     static.add_argument(
         "--torque", type=int, default=0, metavar="N", help="in the first N scenes of a family, compute torques as well"
@@ -145,7 +160,7 @@ def _scenes(arguments: argparse.Namespace) -> list[tuple[str, int, int]]:
 def experiments_of(arguments: argparse.Namespace) -> list[StaticExperiment]:
     """Return the experiments that the options ask for; those of one scene are neighbours."""
     found: dict[StaticExperiment, None] = {}
-    for scene in _scenes(arguments):
+    for skill, scene in _scenes_of_skills(arguments):
         number = scene[2] - arguments.first
         for teachers in arguments.teachers:
             for method in arguments.methods or method_names():
@@ -154,8 +169,40 @@ def experiments_of(arguments: argparse.Namespace) -> list[StaticExperiment]:
                     if setting == "tuned" and not options and "default" in arguments.settings:
                         continue
                     more = {"torque": number < arguments.torque, "memory": number < arguments.memory}
-                    found[StaticExperiment(*scene, method, teachers, options, **more)] = None
+                    found[StaticExperiment(*scene, method, teachers, options, **more, skill=skill)] = None
     return list(found)
+
+
+def _scenes_of_skills(arguments: argparse.Namespace) -> list[tuple[str, tuple[str, int, int]]]:
+    """Return the file of the skill and the scene of each experiment; scenes for which a path is too short are left out.
+
+    Without ``--skill``, the file is empty.
+    """
+    if not arguments.skill:
+        return [("", scene) for scene in _scenes(arguments)]
+    if arguments.teachers != [1]:
+        raise InputError("--teachers: the skills come from files; give either --teachers or --skill")
+    if tuple(arguments.families) == FAMILIES:
+        arguments.families = list(ANY_SKILL)
+    wanted = [(skill, scene) for scene in _scenes(arguments) for skill in arguments.skill]
+    own = sorted(set(arguments.families) - set(ANY_SKILL))
+    if own:
+        raise InputError(f"--families {' '.join(own)}: with --skill, choose from {' '.join(ANY_SKILL)}")
+    found = [(skill, scene) for skill, scene in wanted if _exists(skill, scene)]
+    if len(found) < len(wanted):
+        remark(
+            f"left out {len(wanted) - len(found)} of {len(wanted)} scenes: the path is too short for their obstacles"
+        )
+    return found
+
+
+def _exists(skill: str, scene: tuple[str, int, int]) -> bool:
+    learned = saved_skill(skill)
+    try:
+        static_case(*scene, skill=learned)
+    except InputError:
+        return False
+    return True
 
 
 def _run(arguments: argparse.Namespace) -> int:
