@@ -14,10 +14,19 @@ from imitarm.benchmark import static_tuning
 from imitarm.benchmark.running import Workers
 from imitarm.benchmark.static import RESULTS, StaticExperiment, StaticResult, policy_class
 from imitarm.benchmark.static_claims import claims_table, cost_law, static_tables
-from imitarm.benchmark.static_comparison import PRINTED, mcnemar, pairing, pairings, printed_table, signed_rank, task_of
+from imitarm.benchmark.static_comparison import (
+    PRINTED,
+    mcnemar,
+    pairing,
+    pairings,
+    printed_table,
+    signed_rank,
+    skills_table,
+    task_of,
+    teachers_table,
+)
 from imitarm.benchmark.static_scaling import Plan, exponent, plan_once, scaling_case
 from imitarm.benchmark.static_scenes import ANY_SKILL, learned_skill
-from imitarm.benchmark.static_skills import skills_table, teachers_table
 from imitarm.benchmark.static_tables import (
     StaticResults,
     checked_refusals_table,

@@ -10,14 +10,17 @@ import numpy as np
 from imitarm.benchmark.static_comparison import (
     PRINTED,
     READINGS,
+    common_seeds,
+    numbers_of_teachers,
     p_value,
     paired_table,
     pairings,
     printed_table,
+    skills_table,
     task_of,
+    teachers_table,
     times_table,
 )
-from imitarm.benchmark.static_skills import common_seeds, numbers_of_teachers, skills_table, teachers_table
 from imitarm.benchmark.static_tables import (
     IMPOSSIBLE,
     OURS,
