@@ -99,7 +99,7 @@ def main() -> None:
                 safety = SafetyFilter(arm, clearance=clearance)
                 rollout = reproduce(policy, robot, scene.at, timeout=6.0, safety=safety)
                 near = f"clearance {1e3 * rollout.min_clearance:.0f} mm, " if scene.obstacles else ""
-                held = "" if clearance is None else " with clearance of the links"
+                held = "" if clearance is None else ", the filter keeps a clearance of the links"
                 print(f"  {key}{held}: {near}{rollout.trajectory.duration:.1f} s, {rollout.reason}")
                 if rollout.success:
                     break

@@ -1,8 +1,8 @@
 """Reach into an open box among obstacles, with a skill learned from one teacher and from several teachers.
 
-The teachers are synthetic. Each of them has habits that are the same in all of his demonstrations. The skill of one
-teacher contains his habits; in the mean of several teachers, most habits cancel. The box and the obstacles are solid
-bodies in the simulator, and the plan covers the whole arm.
+The teachers are synthetic. Each of them has habits that are the same in all of his demonstrations. A skill that is
+learned from one teacher contains his habits. With several teachers, most habits average out. The box and the obstacles
+are solid bodies in the simulator, and the plan covers the whole arm.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def main() -> None:
         skill = Skill(n_components=8).fit(align(demonstrations_by(motion, teachers)))
         path = skill.nominal(np.linspace(0.0, skill.duration_, 400)).positions
         away = np.linalg.norm(path[:, None] - ideal, axis=2).min(axis=1)
-        print(f"{teachers} teachers: {1e3 * away.mean():.0f} mm from the ideal path on average")
+        print(f"{teachers} teachers: the learned path is {1e3 * away.mean():.0f} mm from the ideal path on average")
 
     arm = OpenBoxTask.arm()  # a Panda with a gripper
     for n_obstacles in (1, 2, 3):

@@ -49,7 +49,7 @@ SAYS = {
         r"a ball on the path: finished[,;] .*, \d\d mm from the ball",
     ],
     "07_reach_into_an_open_box": [
-        r"10 teachers: \d mm from the ideal path",
+        r"10 teachers: the learned path is \d mm from the ideal path",
         r"3 obstacles: in the box, \d\.\d mm from the goal, clearance [23]\d mm",
         r"without avoidance: .*touched",
         r"with a lid: box \"lid\" covers the goal",
