@@ -65,8 +65,8 @@ def test_no_false_alarm_on_clean_motions(clean):
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("bottle2shelf", set()),
-        ("pouring", {"idle-tail"}),
+        ("bottle2shelf", {"reader"}),  # the assumed order of the quaternions
+        ("pouring", {"idle-tail", "reader"}),
         *((f"letter_{c}", {"planar", "idle-tail"}) for c in "ehl"),
         ("letter_o", {"planar"}),
     ],
@@ -330,6 +330,38 @@ def test_every_unit_that_fits_is_offered(factor, fits, unfit):
     remedy = find("units", lint([large])).remedy
     assert all(f'units="{unit}"' in remedy for unit in fits)
     assert not any(f'units="{unit}"' in remedy for unit in unfit)
+
+
+@pytest.mark.parametrize(
+    ("options", "named", "remedy"),
+    [
+        ({"units": "cm"}, False, 'units="mm" (the motion then extends'),
+        ({"units": "ft"}, False, 'units="mm" (the motion then extends'),
+        ({}, True, "the file states the unit cm; correct the unit in the file to mm (the motion then extends"),
+    ],
+)
+def test_the_remedy_counts_from_the_unit_that_was_used(tmp_path, options, named, remedy):
+    """Millimetres that were read as centimetres or feet: the remedy must not multiply both units."""
+    one = motion().trajectory
+    names = "t,x [cm],y [cm],z [cm]" if named else "t,x,y,z"
+    rows = np.column_stack([one.times, 1e3 * one.positions])
+    np.savetxt(tmp_path / "a.csv", rows, delimiter=",", header=names, comments="", fmt="%.9g")
+    finding = find("units", lint(read_raw(tmp_path / "a.csv", **options)))
+    assert remedy in finding.remedy and 'units="cm"' not in finding.remedy and " in (" not in finding.remedy
+    assert "not the cm" in finding.message or "not the ft" in finding.message
+
+
+@pytest.mark.parametrize(
+    ("factor", "options", "wanted"),
+    [(1e3, {"time_units": "us"}, "ms"), (1.0, {"time_units": "ns"}, "s"), (1.0 / 60.0, {"time_units": "us"}, "min")],
+)
+def test_stamps_that_are_too_close_are_in_another_unit(tmp_path, factor, options, wanted):
+    one = motion().trajectory
+    rows = np.column_stack([factor * (one.times - one.times[0]), one.positions])
+    np.savetxt(tmp_path / "a.csv", rows, delimiter=",", header="t,x,y,z", comments="", fmt="%.12g")
+    finding = find("time-units", lint(read_raw(tmp_path / "a.csv", **options)))
+    assert finding.severity == "error" and f'time_units="{wanted}"' in finding.remedy
+    assert f"are the times in {options['time_units']}?" in finding.message
 
 
 def test_motions_too_fast_for_a_hand():

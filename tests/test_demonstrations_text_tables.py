@@ -331,6 +331,10 @@ def test_other_numbers_of_columns_are_refused():
         "# t\n# x\n# y\n# z\n# qx\n# qy\n# qz\n# qw",
         "# quaternions are xyzw",
         "# order: XYZW",
+        "# quaternions: scalar last",
+        "# the real part comes last",
+        "# format: timestamp(s) tx ty tz qx qy qz qw",
+        "# time, pos x, pos y, pos z, ori x, ori y, ori z, ori w",
         "t (s) x (m) y (m) z (m) qx qy qz qw",
         '"t" "x" "y" "z" "qx" "qy" "qz" "qw"',
         "t,x,y,z,qx,qy,qz,qw",
@@ -341,6 +345,54 @@ def test_names_in_a_row_or_a_remark_are_used(tmp_path, first):
     (one,) = read(write(tmp_path / "a.txt", table, first=first))
     assert np.allclose(one.trajectory.positions, POSES[:, :3])
     assert np.allclose(np.abs(np.sum(one.trajectory.quaternions * TILTED, axis=1)), 1.0)
+
+
+@pytest.mark.parametrize("remark", ["t x y z qx qy qz qw", "rotations xyzw", "format: t x y z qx qy qz qw"])
+@pytest.mark.parametrize("row", [15, 30])
+def test_remarks_between_and_below_the_numbers_count_too(tmp_path, remark, row):
+    table = np.column_stack([0.1 * np.arange(30), 1e3 * POSES[:, :3], TILTED[:, [1, 2, 3, 0]]])
+    lines = write(tmp_path / "a.txt", table).read_text(encoding="utf-8").splitlines()
+    lines[row:row] = [f"# {remark}", "# units: mm"]
+    (tmp_path / "a.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    (one,) = read(tmp_path / "a.txt")
+    assert np.allclose(one.trajectory.positions, POSES[:, :3])
+    assert np.allclose(np.abs(np.sum(one.trajectory.quaternions * TILTED, axis=1)), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "first", "noted"),
+    [
+        ({}, "", True),
+        ({"quaternion_order": "wxyz"}, "", False),
+        ({}, "# wxyz", False),
+        ({}, "t x y z qw qx qy qz", False),
+    ],
+)
+def test_an_assumed_order_of_quaternions_is_noted(tmp_path, options, first, noted):
+    table = np.column_stack([0.1 * np.arange(30), POSES])
+    (raw,) = read_raw(write(tmp_path / "a.txt", table, first=first), **options)
+    assert any("order w x y z was assumed" in note for note in raw.notes) is noted
+    if not first:
+        np.save(tmp_path / "a.npy", table)
+        (raw,) = read_raw(tmp_path / "a.npy", **options)
+        assert any("order w x y z was assumed" in note for note in raw.notes) is noted
+
+
+@pytest.mark.parametrize(
+    ("remark", "message"),
+    [
+        ("velocities", "the remark 'velocities' says that the columns hold velocities, not joint angles"),
+        ("measured torques of each joint", "says that the columns hold torques"),
+        ("joint velocities in rad/s", "states the unit 'rad/s', which is neither a length nor an angle"),
+        ("values in rad per second", "states the unit 'rad per second'"),
+    ],
+)
+def test_a_remark_that_says_that_joint_columns_hold_no_angles_is_believed(tmp_path, remark, message):
+    names = "time " + " ".join(f"right_j{i}" for i in range(7))
+    with pytest.raises(FileFormatError, match=message):
+        read_raw(write(tmp_path / "a.txt", TABLE, first=f"# {remark}\n{names}"))
+    (raw,) = read_raw(write(tmp_path / "a.txt", TABLE, first=f"# joint angles, without velocities\n{names}"))
+    assert np.allclose(raw.joints, TABLE[:, 1:])
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.demonstrations.columns import COUNTS, UNNAMED, in_space, unnamed_columns
+from imitarm.demonstrations.columns import COUNTS, UNNAMED, in_space, order_notes, unnamed_columns, with_units
 from imitarm.demonstrations.raw import RawDemonstration
 from imitarm.demonstrations.reading import Reader, ReadOptions
 from imitarm.errors import FileFormatError
@@ -154,7 +154,8 @@ def _by_field(path: str, arrays: dict[str, Array], options: ReadOptions) -> list
 def _of_fields(source: str, fields: dict[str, Array], options: ReadOptions) -> RawDemonstration:
     positions, times, joints = fields["positions"], fields.get("times"), fields.get("joints")
     unused = sorted(set(fields) - set(_FIELDS))
-    return RawDemonstration(
+    notes = (f"arrays not used: {', '.join(unused)}",) if unused else ()
+    raw = RawDemonstration(
         source,
         options.even_times(source, len(positions)) if times is None else options.seconds(source, times),
         in_space(options.metres(source, positions)),
@@ -162,5 +163,6 @@ def _of_fields(source: str, fields: dict[str, Array], options: ReadOptions) -> R
         joints,
         () if joints is None else tuple(f"joint_{i + 1}" for i in range(joints.shape[1])),
         options.task,
-        notes=(f"arrays not used: {', '.join(unused)}",) if unused else (),
+        notes=notes + (order_notes(options) if "quaternions" in fields else ()),
     )
+    return with_units(raw, options, None, None)

@@ -68,7 +68,7 @@ _WRAPPERS = {
 _TIMES = {"t", "time", "times", "timestamp", "time_stamp", "stamp", "elapsed", "elapsed_time"}
 _TIME_PARTS = {word for word, unit in UNITS["time"].items() if unit in ("s", "ms", "us", "ns") and len(word) > 1}
 _POSITIONS = ("", "p", "p_", "pos_", "position_", "translation_")
-_ROTATIONS = ("q", "q_", "quat_", "quaternion_", "orientation_", "rotation_", "rot_")
+_ROTATIONS = ("q", "q_", "quat", "quat_", "quaternion_", "orientation_", "ori_", "orient_", "rotation_", "rot_")
 _MEANINGS = {
     **dict.fromkeys(_TIMES, "t"),
     **{prefix + axis: axis for prefix in _POSITIONS for axis in "xyz"},
@@ -218,14 +218,14 @@ def named_columns(
     axes = [place[axis] for axis in "xyz" if axis in place]
     stamps = {i: units[i] for i, column in enumerate(columns) if column.what == "t"}
     times = _times(source, names, values, stamps, options, said)
-    positions = angles = None
+    positions = angles = unit = None
     if axes:
         unit = _one_unit(source, "length", names, units, axes, said.length)
         in_space = np.pad(values[:, axes], ((0, 0), (0, 3 - len(axes))))  # planar motions get z = 0
         positions = options.metres(source, in_space, unit)
     if joints:
-        unit = _one_unit(source, "angle", names, units, joints, said.angle)
-        angles = np.radians(values[:, joints]) if unit == "deg" else values[:, joints]
+        degrees = _one_unit(source, "angle", names, units, joints, said.angle) == "deg"
+        angles = np.radians(values[:, joints]) if degrees else values[:, joints]
     ignored = [name for name, column in zip(names, columns, strict=True) if not column.what]
     quaternions = values[:, [place[part] for part in ("qw", "qx", "qy", "qz")]] if "qw" in place else None
     unread: tuple[str, ...] = ()
@@ -238,9 +238,11 @@ def named_columns(
     unused = [name for name in ignored if name not in unread]
     notes = (f"columns not used: {', '.join(unused)}",) if unused else ()
     joint_names = tuple(columns[i].joint for i in joints)
-    return RawDemonstration(
+    raw = RawDemonstration(
         source, times, positions, quaternions, angles, joint_names, options.task, notes=notes, unread_rotation=unread
     )
+    time_unit = next((stated for stated in stamps.values() if stated is not None), said.time) if stamps else None
+    return with_units(raw, options, unit, "s" if len(stamps) > 1 else time_unit)
 
 
 def _with_tum_positions(columns: list[Column], names: Sequence[str]) -> list[Column]:
@@ -411,10 +413,31 @@ def unnamed_columns(
     times = options.seconds(source, values[:, 0], said.time) if start else options.even_times(source, n)
     axes = slice(start, start + (2 if layout == "xy" else 3))
     positions = in_space(options.metres(source, values[:, axes], said.length))
-    quaternions = None
+    quaternions: Array | None = None
+    notes: tuple[str, ...] = ()
     if layout.endswith("q"):
         quaternions = options.wxyz(source, values[:, start + 3 : start + 7], said.quaternion_order)
-    return RawDemonstration(source, times, positions, quaternions, task=options.task)
+        notes = order_notes(options, said)
+    raw = RawDemonstration(source, times, positions, quaternions, task=options.task, notes=notes)
+    return with_units(raw, options, said.length, said.time)
+
+
+def order_notes(options: ReadOptions, said: SaidUnits | None = None) -> tuple[str, ...]:
+    """Return a note about the assumed order of quaternions, unless the file or an option states the order."""
+    if options.quaternion_order is not None or (said is not None and said.quaternion_order is not None):
+        return ()
+    return ("the quaternion columns have no names, so the order w x y z was assumed; the other order is x y z w",)
+
+
+def with_units(raw: RawDemonstration, options: ReadOptions, length: str | None, time: str | None) -> RawDemonstration:
+    """Record the units from which a demonstration was converted; ``length`` and ``time`` are those in the file."""
+    stated = tuple(kind for kind, unit in (("length", length), ("time", time)) if unit is not None)
+    return replace(
+        raw,
+        length_unit=length or options.units or "m",
+        time_unit=time or options.time_units or "s",
+        units_in_file=stated,
+    )
 
 
 def in_space(positions: Array) -> Array:

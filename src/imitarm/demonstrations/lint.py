@@ -34,7 +34,7 @@ from imitarm.demonstrations.raw import (
     ValidRows,
     check_arm_model,
 )
-from imitarm.demonstrations.reading import LENGTH_UNITS
+from imitarm.demonstrations.unit_checks import FARTHEST, check_stamps, check_units
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import quaternion_conjugate, quaternion_log, quaternion_multiply
 from imitarm.trajectory import Demonstration
@@ -52,9 +52,6 @@ _IDLE_FRACTION = 0.05  # of the duration, likewise
 _JUMP = 8.0  # times as fast as the samples around it
 _JUMP_DISTANCE = 3e-3  # [m]
 _JUMP_ANGLE = 0.1  # [rad]
-_FAR = 3.0  # [m] farther than arms reach
-_TINY = 5e-3  # [m] motions smaller than this are rare
-_NO_MOTION = 1e-4  # [m]
 _FAST = 3.0  # [m/s] faster than an arm is guided by hand
 _DURATION_RATIO = 2.0
 _FLAT = 1e-3  # [m] standard deviation below which there is no motion in a direction
@@ -93,7 +90,7 @@ def lint(demonstrations: Sequence[Demonstration | RawDemonstration], *, arm: Arm
     motions: list[ValidRows] = []
     for one in demonstrations:
         raw = RawDemonstration.of(one)
-        for raw_check in RAW_CHECKS:
+        for raw_check in (check_stamps, *RAW_CHECKS):
             findings += raw_check(raw)
         try:
             motion = ValidRows.of(raw.with_poses(arm))
@@ -182,32 +179,11 @@ def _jumps(times: Array, values: Array, floor: float) -> tuple[NDArray[np.int64]
     return jumps + 1, size[jumps]
 
 
-def check_units(motion: ValidRows) -> Iterator[Finding]:
-    """Find positions whose unit can't be the metre, and propose every unit that fits."""
-    distance = np.abs(motion.positions).max(axis=1)
-    extent = float(np.ptp(motion.positions, axis=0).max())
-    if distance.max() > _FAR:
-        row = int(np.argmax(distance))
-        fits = [
-            f'units="{name}" (the motion then extends over {extent * metres:.3g} m and is up to '
-            f"{distance[row] * metres:.3g} m from the base)"
-            for name, metres in LENGTH_UNITS.items()
-            if distance[row] * metres <= _FAR and (extent * metres >= _TINY or extent < _NO_MOTION)
-        ]
-        remedy = f"read it with {' or '.join(fits)}" if fits else "check which columns hold the position"
-        yield motion.finding(
-            "error", "units", f"{distance[row]:.4g} m from the base: the unit is probably not the metre", remedy, row
-        )
-    elif _NO_MOTION < extent < _TINY and motion.quaternions is None:
-        message = f"the whole motion extends over only {1e3 * extent:.2g} mm"
-        yield motion.finding("warning", "units", message, "check the unit: are the numbers in metres?")
-
-
 def check_speed(motion: ValidRows) -> Iterator[Finding]:
     """Find motions that are faster than a person can guide an arm."""
     speed, _ = smooth_speed(motion.times, motion.positions)
     fast = float(np.percentile(speed, 95))
-    if fast > _FAST and np.abs(motion.positions).max() <= _FAR:
+    if fast > _FAST and np.abs(motion.positions).max() <= FARTHEST:
         remedy = "check duration, rate and time_units"
         yield motion.finding("warning", "speed", f"moves at {fast:.1f} m/s", remedy, int(np.argmax(speed)))
 

@@ -30,10 +30,7 @@ _BOUND = 1e30  # larger numbers come from damaged files, and overflow when squar
 _MAX_DROPPED = 0.1  # largest fraction of rows that `repair` may drop
 _SAMPLES = 100  # of each motion, when motions are compared
 
-_EPOCH = 1e8  # [s] later times are dates (after 1973), not times since the start
 _FEW = 20  # samples
-_LONGEST_STEP = 0.5  # [s] between samples
-_STEPS = (2e-4, _LONGEST_STEP)  # [s] between samples of usual recorders
 
 _GENERIC_JOINT = re.compile(r"(?:j|joint|q|a|axis)_?\d+", re.IGNORECASE)
 _NUMBER_AT_END = re.compile(r"(\d+)$")
@@ -93,6 +90,9 @@ class RawDemonstration:
         notes: remarks of the reader about data that it left out, and about its assumptions.
         unread_rotation: names of columns that seem to hold a rotation in a form that can't be read, such as Euler
             angles.
+        length_unit: unit of the lengths in the file, from which ``positions`` were converted.
+        time_unit: unit of the times in the file, from which ``times`` were converted.
+        units_in_file: ``"length"``, ``"time"``, both or neither: the units that the file itself states.
 
     Raises:
         InputError: when an array has the wrong shape or does not contain numbers, or joints and names do not agree.
@@ -108,6 +108,9 @@ class RawDemonstration:
     lines: NDArray[np.int64] | None = None
     notes: tuple[str, ...] = ()
     unread_rotation: tuple[str, ...] = ()
+    length_unit: str = "m"
+    time_unit: str = "s"
+    units_in_file: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         what = f"RawDemonstration {text(self.source, 'RawDemonstration: source')}"
@@ -390,34 +393,6 @@ def check_rows(raw: RawDemonstration) -> Iterator[Finding]:
         yield raw.finding("warning", "few-samples", f"only {len(raw)} samples", remedy)
 
 
-def check_stamps(raw: RawDemonstration) -> Iterator[Finding]:
-    """Find time stamps that do not increase, are dates, or are not in seconds."""
-    late = np.flatnonzero(raw.late())
-    if len(late):
-        row = int(late[0])
-        message = f"{len(late)} time stamps are not later than the previous ones; the first is {raw.times[row]:.6g} s "
-        message += f"after {np.nanmax(raw.times[:row]):.6g} s"
-        remedy = "record again, or read it with repair=True to drop those rows"
-        yield raw.finding("error", "non-monotonic-stamps", message, remedy, row)
-    times = raw.times[~raw.not_finite()]
-    if len(times) < 3:
-        return
-    if np.abs(times).max() > _EPOCH:
-        message = f"time stamps are dates ({times[0]:.0f} s), not seconds since the start"
-        yield raw.finding("note", "epoch-stamps", message, "none needed: align subtracts the first time stamp", 0)
-    step = float(np.median(np.diff(np.sort(times))))
-    if step > _LONGEST_STEP:
-        fits = [
-            f'time_units="{name}" (a sample every {step * factor:.3g} s)'
-            for name, factor in (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))
-            if _STEPS[0] <= step * factor <= _STEPS[1]
-        ]
-        minutes = (times[-1] - times[0]) / 60.0
-        message = f"samples are {step:.4g} s apart, and the motion lasts {minutes:.4g} min; are the times in seconds?"
-        remedy = f"read it with {' or '.join(fits)}" if fits else "check which column holds the time, and its unit"
-        yield raw.finding("error", "time-units", message, remedy)
-
-
 def check_quaternions(raw: RawDemonstration) -> Iterator[Finding]:
     """Find quaternions whose length is not one, and signs that flip."""
     if raw.quaternions is None:
@@ -470,4 +445,4 @@ def check_notes(raw: RawDemonstration) -> Iterator[Finding]:
         yield raw.finding("note", "reader", note, "none needed if you can do without these data")
 
 
-RAW_CHECKS = (check_rows, check_stamps, check_quaternions, check_held, check_notes)
+RAW_CHECKS = (check_rows, check_quaternions, check_held, check_notes)

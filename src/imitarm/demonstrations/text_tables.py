@@ -1,8 +1,8 @@
 """Readers of text tables: imitarm's own CSV, and any other table of numbers.
 
-Column names are read from a separate row or from a remark (a line that starts with ``#`` or ``%``). If nothing in the
-file looks like column names, the meaning of the columns is derived from their number. An unknown unit is an error, and
-so is a remark that looks like column names but can't be understood.
+Column names are read from a separate row or from a remark (a line that starts with ``#`` or ``%``), which may stand
+anywhere in the file. If nothing in the file looks like column names, the meaning of the columns is derived from their
+number. An unknown unit is an error, and so is a remark that looks like column names but can't be understood.
 """
 
 from __future__ import annotations
@@ -26,9 +26,15 @@ Array = NDArray[np.float64]
 _NUMBERED = re.compile(r"(?:col(?:umn)?\s*)?\d+\s*[:=.)]\s*(?P<name>.+)", re.IGNORECASE)
 _ENCLOSED = re.compile(r"^[(\[{]([^()\[\]{}]*)[)\]}]$")
 _UNITS_REMARK = re.compile(r"(?:(?:length|position|time|angle|joint)s?[ _])?units?\s*[:=]\s*(.*)")
-_OTHER_REMARK = re.compile(r"(?:task|source|date|version|format|(?:\w+[ _])?units?)\s*[:=].*", re.IGNORECASE)
+_OTHER_REMARK = re.compile(r"(?:task|source|date|version|(?:\w+[ _])?units?)\s*[:=].*", re.IGNORECASE)
 _PROSE_UNIT = re.compile(r"\bin\s+((?!in\b|min\b|h\b)[^\W\d]+)")
+_PROSE_RATE = re.compile(r"\bin\s+((?:m|cm|mm|rads?|deg|degrees|radians)\s*(?:/|per\s)\s*\w+(?:\^?[-\d]+)?)")
 _ORDER = re.compile(r"\b(xyzw|wxyz)\b", re.IGNORECASE)
+_SCALAR = re.compile(r"\b(?:scalar|real)(?:[\s_-]+part)?(?:[\s_-]+(?:is|comes))?[\s_-]+(first|last)\b", re.IGNORECASE)
+_ANGLES = re.compile(r"\b(?:angles?|positions?)\b", re.IGNORECASE)
+_NO_ANGLES = re.compile(
+    r"\b(?:velocit(?:y|ies)|speeds?|accelerations?|efforts?|torques?|currents?|joint commands?)\b", re.IGNORECASE
+)
 _NATIVE_MARK = re.compile(rb"(?:\xef\xbb\xbf)?(?:\s*[#%][^\n]*\n)*?\s*[#%]\s*format:\s*" + FORMAT.encode() + rb"\b")
 
 
@@ -56,6 +62,7 @@ class ImitarmReader(Reader):
             table.values[:, n_pose:] if len(names) > n_pose else None,
             names[n_pose:],
             table.remarks.get("task", "") or options.task,
+            units_in_file=("length", "time"),
         )
         return [replace(raw, lines=table.lines)]
 
@@ -80,6 +87,8 @@ class TextTableReader(Reader):
         names = _names_of(table)
         raw = named_columns(path, names, table.values, options, said) if names else None
         raw = raw or unnamed_columns(path, table.values, options, said)
+        if raw.positions is None:
+            _check_angles(table)
         if raw.positions is None and options.units is not None:
             raise InputError(f"{path}: holds joint angles but no lengths; leave out the option units")
         limbs = {name.partition("_")[0] for name in raw.joint_names if re.fullmatch(r"(left|right)_.*", name)}
@@ -104,10 +113,35 @@ def _said_units(table: Table) -> SaidUnits:
             units = ", ".join(dict.fromkeys(unit for kind, unit in known.values() if kind != "rotation"))
             what = f"its remarks state two units of {kind}" if kind else f"a remark states the unknown unit {word!r}"
             raise FileFormatError(f"{table.path}: {what}; known: {units}")
+    rates = [match for _, text in table.remark_lines for match in _PROSE_RATE.findall(text.lower())]
+    if rates:
+        raise FileFormatError(
+            f"{table.path}: a remark states the unit {rates[0]!r}, which is neither a length nor an angle; record "
+            "positions or joint angles, or remove the remark"
+        )
     orders = {match.lower() for _, text in table.remark_lines for match in _ORDER.findall(text)}
+    orders |= {
+        {"first": "wxyz", "last": "xyzw"}[match.lower()]
+        for _, text in table.remark_lines
+        for match in _SCALAR.findall(text)
+    }
     if len(orders) > 1:
         raise FileFormatError(f"{table.path}: its remarks state both quaternion orders, wxyz and xyzw; keep one")
     return SaidUnits(found.get("length"), found.get("time"), found.get("angle"), next(iter(orders), None))
+
+
+def _check_angles(table: Table) -> None:
+    """Reject a table of joints if a remark says that the columns hold velocities, torques or the like.
+
+    Raises:
+        FileFormatError: when a remark names such a quantity, but neither angles nor positions.
+    """
+    for number, text in table.remark_lines:
+        if (match := _NO_ANGLES.search(text)) is not None and _ANGLES.search(text) is None:
+            raise FileFormatError(
+                f"{table.path}, line {number}: the remark {text[:60]!r} says that the columns hold {match[0].lower()}, "
+                "not joint angles; record joint angles, or remove the remark"
+            )
 
 
 def _names_of(table: Table) -> tuple[str, ...] | None:

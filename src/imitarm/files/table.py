@@ -2,8 +2,7 @@
 
 A table consists of lines of numbers that are separated by commas, semicolons, tabs or spaces. A row of column names may
 come first, with a row of units below it. If the separator is a semicolon or a tab, numbers may have decimal commas.
-Lines that start with ``#`` or ``%`` are remarks. Remarks before the numbers are kept: they may hold ``key: value``
-pairs or the column names.
+Lines that start with ``#`` or ``%`` are remarks. Remarks may hold ``key: value`` pairs or the column names.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ class Table:
         lines: line number of each row in the file, from 1, shape (n,).
         ends_in_newline: False when the last line may have been cut off.
         names_line: line number of the column names, from 1; None when there are no names.
-        remark_lines: line number and text of each remark before the numbers, without the ``#``.
+        remark_lines: line number and text of each remark in the file, without the ``#``.
     """
 
     path: str
@@ -233,8 +232,9 @@ def parse_table(path: str | Path, content: bytes) -> Table:
     body = [(number, line) for number, line in written if line[0] not in "#%"]
     if not body:
         raise FileFormatError(f"{path}: holds no rows of numbers; record or export it again")
-    remark_lines = tuple((number, line.lstrip("#% \t")) for number, line in written if number < body[0][0])
-    pairs = [text.partition(":") for _, text in remark_lines]
+    remark_lines = tuple((number, line.lstrip("#% \t")) for number, line in written if line[0] in "#%")
+    before = [(number, text) for number, text in remark_lines if number < body[0][0]]
+    pairs = [text.partition(":") for _, text in before]
     remarks = {key.strip().lower(): value.strip() for key, colon, value in pairs if colon}
     names_line: int | None
     names: tuple[str, ...] | None
@@ -245,7 +245,7 @@ def parse_table(path: str | Path, content: bytes) -> Table:
             raise FileFormatError(f"{path}: has column names but no rows; record or export it again")
     else:
         width = len(_fields(body[0][1], _separator(body[0][1])))
-        names_line, names = _names_in_remarks(remark_lines, width)
+        names_line, names = _names_in_remarks(before, width)
     units = _units_row(names, body[0][1]) if names is not None and names_line not in dict(remark_lines) else None
     if names is not None and units is not None:
         names, body = _with_units(names, units), body[1:]
