@@ -11,7 +11,7 @@ import pytest
 
 from demonstration_samples import motion, motions, path, turn, with_idle
 from imitarm.demonstrations import Finding, RawDemonstration, lint, read_raw
-from imitarm.demonstrations.arm_checks import reach
+from imitarm.demonstrations.plausibility import reach
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.pose import quaternion_exp, quaternion_multiply
@@ -538,7 +538,7 @@ def test_an_outlier_in_rotation_such_as_another_quaternion_order():
 
 def test_every_code_is_in_the_documentation():
     root = Path(__file__).resolve().parents[1]
-    files = ("arm_checks.py", "raw.py", "lint.py")
+    files = ("plausibility.py", "raw.py", "lint.py")
     text = " ".join((root / "src/imitarm/demonstrations" / file).read_text() for file in files)
     used = set(re.findall(r'finding\(\s*"(?:error|warning|note)",\s+"([a-z-]+)",', text))
     used |= set(re.findall(r'"((?:mixed|two)-[a-z]+)"', text)) | {"ends", "direction", "incomplete"}

@@ -8,7 +8,7 @@ import numpy as np
 
 from imitarm.cli.robot_options import add_robot_options, load_robot
 from imitarm.cli.screen import say, show_table
-from imitarm.demonstrations.arm_checks import reach
+from imitarm.demonstrations.plausibility import reach
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_file import ARMS, TOOLS

@@ -2,8 +2,8 @@
 
 Each check yields findings. The checks in this module examine each motion by itself, and compare the motions with each
 other. If some demonstrations run backwards, stop early, end elsewhere or take another path, the mean of all
-demonstrations is a motion that nobody demonstrated. Checks of the numbers in a file are in ``raw.py``. Checks of a
-motion against an arm are in ``arm_checks.py``.
+demonstrations is a motion that nobody demonstrated. Checks of the numbers in a file are in ``raw.py``. Checks of
+units, and of a motion against an arm, are in ``plausibility.py``.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from imitarm.demonstrations.align import (
     to_common_ends,
     turns,
 )
-from imitarm.demonstrations.arm_checks import check_arm
 from imitarm.demonstrations.groups import LEAST_GAP, aligned_paths, largest_distances, split_paths, two_groups
+from imitarm.demonstrations.plausibility import FARTHEST, check_arm, check_stamps, check_units
 from imitarm.demonstrations.raw import (
     RAW_CHECKS,
     SEVERITIES,
@@ -34,7 +34,6 @@ from imitarm.demonstrations.raw import (
     ValidRows,
     check_arm_model,
 )
-from imitarm.demonstrations.unit_checks import FARTHEST, check_stamps, check_units
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import quaternion_conjugate, quaternion_log, quaternion_multiply
 from imitarm.trajectory import Demonstration
