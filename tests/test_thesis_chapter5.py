@@ -7,6 +7,7 @@ import time
 import numpy as np
 import pytest
 
+from imitarm.evaluation.intervals import wilson_interval
 from imitarm.kinematics.pose import Pose
 from imitarm.perception import Detection, ObstacleTracker
 from imitarm.policies import RCAMO, DistanceCost, GaussianCost
@@ -131,3 +132,8 @@ def test_the_cost_of_figure_5_3_is_lowest_on_the_path_and_highest_at_the_obstacl
     assert cost[inside].min() > cost[~inside].max() and cost[[0, -1]].max() < 1e-3
     grid = np.zeros((4, 5, 3))
     assert policy.cost_field(Scene(), grid).shape == (4, 5)
+
+
+def test_five_runs_without_a_failure_show_little():
+    low, high = wilson_interval(5, 5)
+    assert 0.56 < low < 0.58 and high == pytest.approx(1.0)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from imitarm.benchmark import avoidance, packing, placement_comparison, placements, real_motions, refusals
+from imitarm.benchmark import avoidance, placement_comparison, placements, real_motions, refusals, repeated_tasks
 from imitarm.benchmark.experiment import METHODS, Result
 from imitarm.benchmark.mapping import MappingBenchmark, run_all, tables, write_tables
 from imitarm.benchmark.mapping_tables import TEST, Results
@@ -19,6 +19,7 @@ from imitarm.benchmark.placement_tables import placement_tables
 from imitarm.benchmark.provenance import code_version, origin
 from imitarm.benchmark.recordings import KINDS
 from imitarm.benchmark.refusal_proof import Answer
+from imitarm.benchmark.repeated_tasks import REPEATED_TASKS, RepeatedTask
 from imitarm.cli.benchmark_moving import add_moving
 from imitarm.cli.benchmark_options import add_fill, add_workers, place_of, report_tables, workers_of
 from imitarm.cli.benchmark_perception import add_perception
@@ -31,7 +32,6 @@ from imitarm.cli.screen import progress_bar, remark, say
 from imitarm.errors import InputError
 from imitarm.policies import POLICIES
 from imitarm.policies.adaptation import ADAPTERS
-from imitarm.tasks.packing_run import OBSERVERS
 
 OTHERS = (add_static, add_moving, add_tracking, add_perception)
 """Benchmarks with a file of their own: the functions that add their parsers."""
@@ -48,6 +48,7 @@ examples:
   imitarm benchmark placements --policies acfra rrt-connect --max-tilt 30 --out placements.jsonl
   imitarm benchmark comparison placements.jsonl
   imitarm benchmark packing --seeds 100 --out packing
+  imitarm benchmark pushed-cube --observer camera --seeds 20
   imitarm benchmark people recordings person.mp4
   imitarm benchmark refusals --scenes 1000
   imitarm benchmark static --count 100 --out static
@@ -126,24 +127,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_fill(third)
     third.set_defaults(benchmark=_refusals)
     _add_placements(parsers)
-    packed = parsers.add_parser(
-        "packing", help="pick a cube and put it into a moving box while a bottle is pushed about (thesis Fig 5.6)"
-    )
-    packed.add_argument("--seeds", type=int, default=20, metavar="N", help="number of runs; default: 20")
-    packed.add_argument("--first", type=int, default=0, metavar="N", help="seed of the first run; default: 0")
-    packed.add_argument(
-        "--observer", choices=OBSERVERS, default="sensor", help="how box and bottle are observed; default: sensor"
-    )
-    packed.add_argument(
-        "--out",
-        type=Path,
-        default=Path("benchmark-packing"),
-        metavar="FOLDER",
-        help="folder for the results, in which an interrupted run continues; default: benchmark-packing",
-    )
-    add_workers(packed)
-    add_fill(packed)
-    packed.set_defaults(benchmark=_packing)
+    for name, task in REPEATED_TASKS.items():
+        _add_repeated(parsers, name, task)
     for add in OTHERS:
         add(parsers)
     people = parsers.add_parser("people", help="retarget recordings of real people to simulated arms")
@@ -297,12 +282,33 @@ def _refusals(arguments: argparse.Namespace) -> int:
     return int(any(v.is_violation for v in verdicts))
 
 
-def _packing(arguments: argparse.Namespace) -> int:
-    """Run the packing task with many seeds and print its table."""
-    place = place_of(arguments, "packing")
+def _add_repeated(parsers: Any, name: str, task: RepeatedTask) -> None:
+    """Add the command that runs a task with many seeds."""
+    parser = parsers.add_parser(name, help=task.title[0].lower() + task.title[1:])
+    parser.add_argument("--seeds", type=int, default=20, metavar="N", help="number of runs; default: 20")
+    parser.add_argument("--first", type=int, default=0, metavar="N", help="seed of the first run; default: 0")
+    parser.add_argument(
+        "--observer", choices=task.observers, default="sensor", help="how the obstacles are observed; default: sensor"
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path(f"benchmark-{name}"),
+        metavar="FOLDER",
+        help=f"folder for the results, in which an interrupted run continues; default: benchmark-{name}",
+    )
+    add_workers(parser)
+    add_fill(parser)
+    parser.set_defaults(benchmark=_repeated, task=name)
+
+
+def _repeated(arguments: argparse.Namespace) -> int:
+    """Run a task with many seeds and print its table."""
+    place = place_of(arguments, arguments.task)
     with progress_bar() as progress:
-        bar = progress.add_task("packing", total=arguments.seeds)
-        results = packing.run_packings(
+        bar = progress.add_task(arguments.task, total=arguments.seeds)
+        results = repeated_tasks.run_repeatedly(
+            arguments.task,
             arguments.seeds,
             first=arguments.first,
             observer=arguments.observer,
@@ -310,7 +316,7 @@ def _packing(arguments: argparse.Namespace) -> int:
             out=arguments.out,
             on_done=lambda done, total: progress.update(bar, completed=done, total=total),
         )
-    report_tables(packing.packing_tables(results), place, [result.code for result in results])
+    report_tables(repeated_tasks.success_tables(results), place, [result.code for result in results])
     return 0
 
 

@@ -213,8 +213,8 @@ class ObstacleDetector:
                 return message
         if inside.mean() > _INSIDE:
             return (
-                f"{100.0 * inside.mean():.0f} % of the rays go through known surfaces; the camera was moved: calibrate "
-                "it again"
+                f"{100.0 * inside.mean():.0f} % of the rays go through known surfaces; the camera was moved (calibrate "
+                "it again), or a surface is smaller than stated (a table top is a Box, a HalfSpace has no edges)"
             )
         return ""
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from imitarm.tasks.open_box import OpenBoxTask
 from imitarm.tasks.packing import PackingTask
+from imitarm.tasks.packing_run import run_packing
+from imitarm.tasks.pushed_cube import run_pushed_cube
 from imitarm.tasks.stack import StackTask
 from imitarm.tasks.sweep import DEMONSTRATIONS, MOVING_SCENES, NUMBERED_SCENES, SCENES, SweepTask
 
@@ -24,4 +26,6 @@ __all__ = [
     "PackingTask",
     "StackTask",
     "SweepTask",
+    "run_packing",
+    "run_pushed_cube",
 ]

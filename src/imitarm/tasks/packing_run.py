@@ -13,12 +13,10 @@ from imitarm.control_loop.camera_observer import CameraObserver
 from imitarm.control_loop.observer import SensorModel, TrackedScene
 from imitarm.control_loop.reproduce import Step, reproduce
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.pose import Pose, matrix_to_quaternion
+from imitarm.kinematics.pose import Pose
 from imitarm.perception import (
     DepthFrame,
-    DepthNoise,
     Detection,
-    Intrinsics,
     ObstacleDetector,
     ObstacleTracker,
     PointCloud,
@@ -26,7 +24,6 @@ from imitarm.perception import (
 )
 from imitarm.policies import Stage, StagedPolicy
 from imitarm.policies.rcamo import RCAMO
-from imitarm.robots.depth_camera import DepthCamera
 from imitarm.robots.simulated import SimulatedRobot
 from imitarm.safety import SafetyFilter
 from imitarm.scene import Scene
@@ -43,20 +40,18 @@ from imitarm.tasks.packing import (
     packing_fixtures,
     packing_skills,
 )
+from imitarm.tasks.watching import PERIOD, WATCHES, camera_in_front, watch
 from imitarm.trajectory import Rollout
 
 Array = NDArray[np.float64]
 Observer = Callable[[PackingTask, SimulatedRobot], Callable[[float], Scene]]
-DT = 0.01  # [s] control period
 _NEAR_CUBE, _NEAR_BOX = 0.004, 0.015  # [m] from the goal: the gripper closes on the cube, opens above the box
 _FINGERS = 1.0  # [s] in which the fingers close or open
-_PIXELS, _FIELD_OF_VIEW = (200, 150), 0.9  # columns and rows, vertical [rad]
 _EYE, _MIDDLE = (
     np.array([1.45, -0.05, 0.95]),
     np.array([0.56, -0.02, 0.05]),
 )  # [m] place of the camera, what it looks at
 _WORKSPACE = ((0.30, -0.60, 0.0), (1.0, 0.60, 0.6))  # [m]
-_WATCHES = 1.0  # [s] before the arm moves
 _RIM, _FEWEST, _WRONG = 0.03, 30, 0.06  # [m] height of points of the rim, their least number, [m] error of its size
 _BOX_SIGMA = 0.006  # [m] standard deviation of the middle of the rim
 _ON_TABLE = 0.03  # [m] height of the underside of a cube that is not in the gripper
@@ -114,10 +109,10 @@ def run_packing(
     """
     robot = task.robot(arm=arm)
     observe = (sensed if observer is None else observer)(task, robot)
-    safety = SafetyFilter(robot.arm, dt=DT, clearance=_LINKS)
+    safety = SafetyFilter(robot.arm, dt=PERIOD, clearance=_LINKS)
     grasp = observe.grasp if isinstance(observe, Watched) else lambda: task.grasp
     policy = packing_policy(task, robot.arm, grasp)
-    done = reproduce(policy, robot, observe, dt=DT, timeout=task.timeout, safety=safety, on_step=on_step)
+    done = reproduce(policy, robot, observe, dt=PERIOD, timeout=task.timeout, safety=safety, on_step=on_step)
     return task.evaluate(robot, done)
 
 
@@ -179,16 +174,7 @@ class Watched:
     """
 
     def __init__(self, task: PackingTask, robot: SimulatedRobot) -> None:
-        camera = DepthCamera(
-            robot,
-            Intrinsics.from_field_of_view(*_PIXELS, _FIELD_OF_VIEW),
-            _looking_at(_EYE, _MIDDLE),
-            nearest=0.5,
-            farthest=5.0,
-            noise=DepthNoise(),
-            seed=task.seed,
-            color=True,
-        )
+        camera = camera_in_front(robot, _EYE, _MIDDLE, seed=task.seed, color=True)
         detector = PackingDetector(
             task,
             robot.arm,
@@ -196,14 +182,11 @@ class Watched:
             workspace=_WORKSPACE,
             split=False,
         )
-        start = robot.time + _WATCHES
-        self._observe = CameraObserver(
-            camera.frame, detector, ObstacleTracker(), joints=lambda: robot.state().q, clock=start
-        )
         self._task, self._cube = task, task.grasp_at(np.array([*_MIDDLE[:2], 0.0]))
-        while robot.time < start - 0.5 * DT:
-            self(robot.time - start)
-            robot.move(np.zeros(robot.arm.n_joints), DT)
+        self._observe = CameraObserver(
+            camera.frame, detector, ObstacleTracker(), joints=lambda: robot.state().q, clock=robot.time + WATCHES
+        )
+        watch(robot, self)
 
     def __call__(self, time: float) -> Scene:
         """Return box and bottle as the camera and the tracker know them."""
@@ -219,14 +202,6 @@ class Watched:
     def grasp(self) -> Pose:
         """Return the pose of the tool in which the fingers close on the cube where it was last seen on the table."""
         return self._cube
-
-
-def _looking_at(eye: Array, target: Array) -> Pose:
-    """Return the pose of a camera whose z axis points from ``eye`` to ``target`` and whose y axis points down."""
-    z = (target - eye) / np.linalg.norm(target - eye)
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    x /= np.linalg.norm(x)
-    return Pose(eye, matrix_to_quaternion(np.column_stack([x, np.cross(z, x), z])))
 
 
 OBSERVERS: dict[str, Observer] = {"exact": exact, "sensor": sensed, "camera": Watched}

@@ -17,7 +17,7 @@ from imitarm.kinematics.arm_kinematics import find_posture
 from imitarm.kinematics.pose import Pose
 from imitarm.robots.simulated import Control, SimulatedRobot
 from imitarm.robots.world import arm_world
-from imitarm.scene import HalfSpace, MovingScene, Scene, load_moving_scene, load_scene, standard_fixtures
+from imitarm.scene import Box, HalfSpace, MovingScene, Scene, load_moving_scene, load_scene, standard_fixtures
 from imitarm.tasks.habits import Motion, along
 from imitarm.trajectory import Rollout, Trajectory
 
@@ -58,7 +58,7 @@ _WOOD, _LEG, _PAN, _DIRT = (
 
 @dataclass(frozen=True)
 class SweepTask:
-    """A Sawyer with a curved brush, dirt on a table, and a dustpan recessed into the table.
+    """An arm with a curved brush, dirt on a table, and a dustpan recessed into the table.
 
     The brush starts at the point S, moves to the dirt at the point T, and pushes the dirt to the point G in the
     dustpan. The brush moves just above the table. The open side of the brush points in the direction of motion. The two
@@ -89,9 +89,13 @@ class SweepTask:
             )
 
     @staticmethod
-    def arm() -> ArmModel:
-        """Load the Sawyer with the brush."""
-        return ArmModel.load("sawyer", tool="brush")
+    def arm(robot: str = "sawyer") -> ArmModel:
+        """Load an arm with the brush.
+
+        Args:
+            robot: name of the arm, ``"sawyer"`` or ``"panda"``, or another arm that reaches S, T and G.
+        """
+        return ArmModel.load(robot, tool="brush")
 
     @staticmethod
     def scene(name: str) -> Scene:
@@ -220,6 +224,12 @@ class SweepTask:
             faults.append(f"an obstacle was touched: clearance {1e3 * rollout.min_clearance:.1f} mm")
         details = {**rollout.details, "swept_fraction": fraction, "swept": swept}
         return replace(rollout, success=not faults, reason="; ".join(faults) or "dirt in the pan", details=details)
+
+
+def table_top() -> Box:
+    """Return the table top as an obstacle; a camera sees past its edges."""
+    place = Pose(np.array([*TABLE_CENTER, -0.5 * TABLE_SIZE[2]]), np.array([1.0, 0.0, 0.0, 0.0]))
+    return Box(place, np.array(TABLE_SIZE), name="table")
 
 
 def _add_table(spec: mujoco.MjSpec) -> None:
