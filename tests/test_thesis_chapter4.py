@@ -49,6 +49,22 @@ def test_the_repulsion_acts_within_its_distance_and_not_beyond_as_the_text_of_2_
     assert not literal_force(beyond, normal, beyond).any()
 
 
+@given(seeds)
+def test_the_force_of_equation_4_7_depends_on_the_distance_and_not_on_the_deviation(seed):
+    """A component that is far from the learned path is pushed as hard as one on it, at the same distance."""
+    rng = np.random.default_rng(seed)
+    learned, moved = np.zeros(3), rng.normal(size=3)
+    away = rng.normal(size=3)
+    away /= np.linalg.norm(away)
+    gap, radius = rng.uniform(0.2, 0.9) * INFLUENCE_DISTANCE, 0.03
+    forces = []
+    for mean in (learned, moved):
+        obstacle = Sphere(mean - (radius + gap) * away, radius)
+        distance, normal = obstacle.distance_and_gradient(mean[None])
+        forces.append(literal_force(distance[None], normal[None], distance[None])[0, 0])
+    np.testing.assert_allclose(forces[1], forces[0], rtol=1e-6)
+
+
 def test_with_the_distance_of_equation_2_20_a_long_obstacle_is_touched_without_a_force():
     wall = Box(Pose([0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]), [0.6, 0.02, 0.2])
     touching = np.array([0.28, 0.01, 0.0])
