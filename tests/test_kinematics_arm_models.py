@@ -135,6 +135,10 @@ SEVERAL = {
         "".join(limb(f"leg{i}_", 3) for i in range(4)) + limb("arm_", 5),
         {"arm_link5": 5} | {f"leg{i}_link3": 3 for i in range(4)},
     ),
+    "an arm with a camera on its forearm": (
+        SIX + link("camera") + joint("look", "a_link4", "camera"),
+        {"a_link6": 6, "camera": 5},
+    ),
     "arms with a gripper each": (
         limb("l_", 5) + hinge("l_gripper", "l_link5", "l_jaw") + limb("r_", 6) + hinge("r_gripper", "r_link6", "r_jaw"),
         {"l_link5": 5, "r_link6": 6},
@@ -202,6 +206,9 @@ def limits(kind="revolute", **values):
 BAD_LIMITS = {
     "exchanged": (limits(lower=1, upper=-1, effort=5, velocity=1), "lower limit 1 is above upper limit -1"),
     "exchanged slide": (limits("prismatic", lower=0.3, upper=0.1, effort=5, velocity=1), "exchange them"),
+    "only lower": (limits(lower=-1, effort=5, velocity=1), "has the limit lower, but not upper; add upper="),
+    "only upper": (limits("prismatic", upper=0.2, effort=5, velocity=1), "has the limit upper, but not lower"),
+    "no range": (limits(lower=1, upper=1 + 1e-8, effort=5, velocity=1), "can't move"),
     "equal": (limits(lower=0, upper=0, effort=5, velocity=1), "can't move"),
     "not given": (limits(effort=5, velocity=1), "has no limits"),
     "no element": (limits(), "or make it continuous"),
@@ -527,6 +534,22 @@ def test_home_is_within_limits_clear_of_itself_and_not_singular(load, n, stretch
     assert home[-1] > 0.05 * min(1.0, stretch * n * 0.22 / 0.8)
     assert shapes_apart(arm, arm.home) >= 0.02
     assert np.array_equal(arm.home, load(text).home)
+
+
+@pytest.mark.parametrize(("low", "high"), [(6.0, 6.2), (-9.0, -4.0), (3.3, 9.0), (-0.2, 6.0)])
+def test_home_is_within_limits_that_are_far_from_zero(load, low, high):
+    text = robot(SIX)
+    head, separator, tail = text.partition("<joint name='a_axis2'")
+    arm = load(head + separator + tail.replace("lower='-2.5' upper='2.5'", f"lower='{low}' upper='{high}'", 1))
+    arm.check_limits(arm.home)
+    assert low <= arm.home[1] <= high
+
+
+@pytest.mark.parametrize("axis", ["0 0 0", "0 1e-12 0"])
+def test_an_axis_without_a_direction_is_refused_with_its_line(load, axis):
+    text = robot(limb("a_", 2)).replace("<axis xyz='0 1 0'/>", f"<axis xyz='{axis}'/>")
+    with pytest.raises(FileFormatError, match=r"joint 'a_axis2', line \d+: xyz='.*' of <axis> has no direction"):
+        load(text)
 
 
 def test_the_middle_of_the_ranges_is_kept_where_it_is_usable(load):

@@ -69,8 +69,9 @@ class _HomeSearch:
         limited = model.jnt_limited[ids].astype(bool)
         slides = model.jnt_type[ids] == mujoco.mjtJoint.mjJNT_SLIDE
         far = np.where(slides, 1.0, math.pi)
-        self._low = np.where(limited, np.maximum(model.jnt_range[ids, 0], -far), -far)
-        self._high = np.where(limited, np.minimum(model.jnt_range[ids, 1], far), far)
+        low, high = np.where(limited, model.jnt_range[ids].T, np.array([[-np.inf], [np.inf]]))
+        nearest = np.clip(0.0, low, high)  # a range need not contain 0
+        self._low, self._high = np.maximum(low, nearest - far), np.minimum(high, nearest + far)
         self._jacobian = np.zeros((6, model.nv))
         pairs, probes = self._link_pairs(), self.candidates()[:: _SAMPLES // 8]
         # Shapes that overlap in every posture are drawn too large or belong together; they say nothing about a home.

@@ -31,6 +31,8 @@ _PALM_LINK = re.compile(r"base|mount|palm|body|hand", re.IGNORECASE)
 _END_LINK = re.compile(r"(^|[_/-])(tool0|flange)$", re.IGNORECASE)
 _JAW_STROKE = 0.1  # [m] a slide at the end of an arm that moves no further is taken for a jaw
 _FASTEST = 25.0  # [rad/s] no joint of an arm is faster
+_LEAST_RANGE = 1e-6  # [rad] or [m] a joint with a smaller range can't move
+_LONG_ARM = 5  # joints: a fork behind so many is a hand; behind fewer joints, only if its branches are equally long
 _SIDE_BRANCH = 2  # joints: a branch of at most so many beside one more than twice as long is no arm (a head, a wheel)
 
 
@@ -66,8 +68,9 @@ def arm_end(spec: mujoco.MjSpec, path: Path) -> tuple[mujoco.MjsBody, list[str]]
     """Return the last body of the only arm in ``spec``, and notes on the bodies that were left out.
 
     The arm ends before the jaws or fingers of a hand. Jaws and fingers are recognised by joint names such as jaw or
-    finger, or as parallel joints coupled to each other (mimic joints). A short slide at the end, and several short
-    chains that branch off at the end of a longer chain, also count as jaws and fingers. A short branch (such as a head
+    finger, or as parallel joints coupled to each other (mimic joints). A short slide at the end also counts as a jaw.
+    Several short chains that branch off at the end of a longer chain count as fingers, if they are equally long or if
+    the longer chain has five joints. A short branch (such as a head
     or a wheel) next to a much longer chain is left out.
 
     Raises:
@@ -110,7 +113,8 @@ def _limbs(body: mujoco.MjsBody, before: tuple[str, ...], hand: frozenset[str], 
         return [_Limb(_last_fixed(body), joints)] if joints else []
     depths = [max(len(limb.joints) for limb in limbs) - len(joints) for limbs in branches]
     longest = max(depths)
-    if len(branches) > 1 and len(joints) >= 2 and longest < len(joints):
+    fingers = len(joints) >= _LONG_ARM or min(depths) == longest
+    if len(branches) > 1 and len(joints) >= 2 and longest < len(joints) and fingers:
         notes.append(f"not part of the arm: the {len(branches)} chains that branch off at {body.name!r} (a hand)")
         return [_Limb(body, joints)]
     is_arm = [depth > _SIDE_BRANCH or longest <= 2 * depth for depth in depths]
@@ -312,10 +316,13 @@ def _urdf_limits(joint: XmlElement, where: str) -> tuple[float, float]:
         free = ", or make it continuous" if kind == "revolute" else ""
         if limit is None or not limit.attributes.keys() & {"lower", "upper"}:
             raise FileFormatError(f"{where} is {kind} but has no limits; add <limit lower=... upper=.../>{free}")
+        for key, other in (("lower", "upper"), ("upper", "lower")):
+            if key not in limit.attributes:
+                raise FileFormatError(f"{where} has the limit {other}, but not {key}; add {key}=... to <limit>{free}")
         lower, upper = (_limit(limit, key, where) or 0.0 for key in ("lower", "upper"))
         if lower > upper:
             raise FileFormatError(f"{where}: lower limit {lower:g} is above upper limit {upper:g}; exchange them")
-        if lower == upper:
+        if upper - lower < _LEAST_RANGE:
             raise FileFormatError(
                 f"{where}: lower and upper limit are both {lower:g}, so it can't move; write the true limits{free}, or "
                 "make it fixed"

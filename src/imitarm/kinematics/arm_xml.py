@@ -36,6 +36,7 @@ _NAMES = {
     "model",
 }
 _MOST_ROTATION = 25.0  # [rad] limits of a hinge beyond this are degrees
+_SHORTEST_AXIS = 1e-9  # an axis shorter than this has no direction
 _LEAST_ROTATION = 0.2  # [rad] an arm none of whose hinges moves so far has limits in another unit
 _RANGES = ("range", "actuatorfrcrange", "ctrlrange", "forcerange")
 _MESHES = {".stl", ".obj", ".msh"}
@@ -114,6 +115,11 @@ def _check_numbers(path: Path, root: XmlElement) -> None:
                 fault = "not finite"
             elif element.tag == "limit" and value.strip() and not numbers:
                 fault = "not a number"
+            elif element.tag == "axis" and numbers and math.hypot(*numbers) < _SHORTEST_AXIS:
+                raise FileFormatError(
+                    f"{path}: {owner}line {element.line}: {key}={value!r} of <axis> has no direction; write the "
+                    "direction of the joint's axis"
+                )
             if fault:
                 raise FileFormatError(
                     f"{path}: {owner}line {element.line}: {key}={value!r} of <{element.tag}> is {fault}; write a "
