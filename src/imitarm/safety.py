@@ -18,8 +18,9 @@ from imitarm.kinematics.least_violation import least_violation
 from imitarm.kinematics.limits import JointLimits, Limit
 from imitarm.kinematics.tasks import ElbowTask, JointVelocityTask, PostureTask, Task, TwistTask
 from imitarm.perception.margins import CoverageMargin
+from imitarm.scene.arm_rows import NearRows
 from imitarm.scene.clearance import SelfClearance
-from imitarm.scene.clearance_limit import ClearanceLimit, NearRows, violable
+from imitarm.scene.clearance_limit import ClearanceLimit
 from imitarm.scene.scene import Scene
 from imitarm.validation import finite_number, finite_vector, instance
 
@@ -193,9 +194,7 @@ class SafetyFilter:
                 margins = np.asarray(self.margin.at(ages + self.latency), dtype=float)
             near = self._obstacles.near(q, scene, velocity, margins, box)
         if self._own is not None:
-            own = self._own.rows(q)
-        if own is not None and box is not None and not violable(own.matrix, own.lower, box).any():
-            own = None
+            own = self._own.rows(q, box)
         return near, own
 
     def _box(self, velocity: Array) -> Box | None:

@@ -7,6 +7,9 @@
 #include <math.h>
 #include <stdlib.h>
 
+#define ROUNDING 1e-9 /* [m/s] so that no row is left out too early because of rounding */
+#define MAX_JOINTS 64
+
 /* An arm in one posture: m spheres, each moved by some of the n joints.
  *
  * moves (m, n): 1 where a joint moves a sphere, else 0; dofs (n): rows of cdof, MuJoCo's twists of the joints about
@@ -18,53 +21,148 @@ typedef struct {
     const double *cdof, *com;
 } Arm;
 
-/* Speed at which each joint moves a point along n; zero for joints whose factor in moves is 0. */
-static void speeds(double *row, const Arm *arm, const double *point, const double *n, const double *outer,
-                   const double *inner)
+/* Velocity of a point for a unit velocity of each joint, shape (n, 3); 0 for joints whose factor in moves is 0. */
+static void point_jacobian(double *jacobian, const Arm *arm, const double *point, const double *moves)
 {
     double a = point[0] - arm->com[0], b = point[1] - arm->com[1], c = point[2] - arm->com[2];
-    double torque[3] = {b * n[2] - c * n[1], c * n[0] - a * n[2], a * n[1] - b * n[0]};
     for (int64_t k = 0; k < arm->n; k++) {
-        const double *twist = arm->cdof + 6 * arm->dofs[k];
-        double factor = outer[k] - (inner ? inner[k] : 0.0);
-        double speed = torque[0] * twist[0] + torque[1] * twist[1] + torque[2] * twist[2];
-        row[k] = factor * (speed + n[0] * twist[3] + n[1] * twist[4] + n[2] * twist[5]);
+        const double *w = arm->cdof + 6 * arm->dofs[k], *v = w + 3;
+        double *column = jacobian + 3 * k, factor = moves[k];
+        column[0] = factor * (v[0] + w[1] * c - w[2] * b);
+        column[1] = factor * (v[1] + w[2] * a - w[0] * c);
+        column[2] = factor * (v[2] + w[0] * b - w[1] * a);
     }
 }
 
-/* Find all pairs of an obstacle and a sphere that are within the reach of the sphere.
- *
- * centers (m, 3); reach (m). Out: for each of at most n_obstacles * m pairs, indices of obstacle and sphere (2 each),
- * the distance, the speed of the obstacle's nearest point along the normal and the variance of the obstacle's position
- * along the normal (3 each), and the row (n each). Returns the number of pairs. */
-int64_t obstacle_rows(const Obstacles *obstacles, double dt, const Arm *arm, const double *centers, const double *reach,
-                      int64_t *indices, double *values, double *rows)
+/* Velocity along a normal for a unit velocity of each joint. */
+static void along(double *row, const double *jacobian, const double *normal, int64_t n)
 {
-    int64_t found = 0;
+    for (int64_t k = 0; k < n; k++)
+        row[k] = normal[0] * jacobian[3 * k] + normal[1] * jacobian[3 * k + 1] + normal[2] * jacobian[3 * k + 2];
+}
+
+/* The largest speed of a point within bounds of the joint velocity. */
+static double fastest(const double *jacobian, const double *lower, const double *upper, int64_t n)
+{
+    double sum = 0.0;
+    for (int64_t k = 0; k < n; k++) {
+        const double *column = jacobian + 3 * k;
+        double most = fabs(lower[k]) > fabs(upper[k]) ? fabs(lower[k]) : fabs(upper[k]);
+        sum += most * sqrt(column[0] * column[0] + column[1] * column[1] + column[2] * column[2]);
+    }
+    return sum;
+}
+
+/* How fast a distance may shrink; arrays and numbers as in ClearanceLimit and shrink_rates, where they are explained.
+ *
+ * reduced (m); accelerations, velocities (n): limits of the joints. */
+typedef struct {
+    const double *reduced, *accelerations, *velocities;
+    double rate, retreat, deviations, share, longest, unmoved;
+} Limit;
+
+/* The least allowed derivative of the remaining distance `room`, when the obstacle approaches at a speed. */
+static double bound(const Limit *limit, const double *row, int64_t n, double room, double approach, double delay,
+                    double braking)
+{
+    double time = 0.0;
+    if (approach > 0.0) {
+        double acceleration = 0.0, velocity = 0.0;
+        for (int64_t k = 0; k < n; k++) {
+            acceleration += fabs(row[k]) * limit->accelerations[k];
+            velocity += fabs(row[k]) * limit->velocities[k];
+        }
+        acceleration *= limit->share;
+        time = approach > velocity ? 0.0 : approach / (acceleration > 1e-9 ? acceleration : 1e-9);
+        time = time < limit->longest ? time : limit->longest;
+    }
+    time = time > braking ? time : braking;
+    double rate = 1.0 / (delay + 0.5 * time);
+    rate = rate < limit->rate ? rate : limit->rate;
+    return approach - (room < 0.0 ? limit->retreat : rate) * room;
+}
+
+/* A number that is not smaller than the result of bound. */
+static double bound_of_bounds(const Limit *limit, double room, double approach, double delay, double braking)
+{
+    double time = approach > 0.0 && limit->longest > braking ? limit->longest : braking;
+    double rate = 1.0 / (delay + 0.5 * time);
+    rate = rate < limit->rate ? rate : limit->rate;
+    return approach - (room < 0.0 ? limit->retreat : rate) * room;
+}
+
+/* Whether some velocity v within bounds violates row . v >= least. */
+static int violable(const double *row, int64_t n, double least, const double *lower, const double *upper)
+{
+    double smallest = 0.0;
+    for (int64_t k = 0; k < n; k++)
+        smallest += row[k] * (row[k] > 0.0 ? lower[k] : upper[k]);
+    return least > smallest;
+}
+
+/* Whether no joint changes the distance of a row. */
+static int unmoved(const double *row, int64_t n, double least)
+{
+    double squared = 0.0;
+    for (int64_t k = 0; k < n; k++)
+        squared += row[k] * row[k];
+    return squared <= least * least;
+}
+
+/* Find the rows of all pairs of an obstacle and a sphere that are within the reach of the sphere.
+ *
+ * centers (m, 3); reach (m). margins, delays: of each obstacle; margins may be null. braking: time in which the joints
+ * can brake to rest. lower, upper (n): bounds of the joint velocity; rows that no velocity within them violates are left
+ * out. scratch: 3 n + 1 numbers for each sphere. Out: for each of at most n_obstacles * m rows, the indices of obstacle
+ * and sphere (2 each), the remaining distance and the least allowed derivative (2 each), and the row (n each). Returns
+ * their number. */
+int64_t obstacle_rows(const Obstacles *obstacles, double dt, const Arm *arm, const double *centers, const double *reach,
+                      const Limit *limit, const double *margins, const double *delays, double braking,
+                      const double *lower, const double *upper, double *scratch, int64_t *indices, double *values,
+                      double *rows)
+{
+    int64_t found = 0, n = arm->n;
+    double *jacobians = scratch, *speeds = scratch + 3 * n * arm->m; /* a negative speed is not known yet */
     Solid solid;
+    for (int64_t j = 0; j < arm->m; j++)
+        speeds[j] = -1.0;
     for (int64_t i = 0; i < obstacles->n; i++) {
         const double *v = obstacles->velocities + 3 * i, *w = obstacles->rates + 3 * i;
         const double *P = obstacles->covariances + 9 * i;
         place(&solid, obstacles, i, dt);
         for (int64_t j = 0; j < arm->m; j++) {
             const double *c = centers + 3 * j;
-            double d[3] = {c[0] - solid.center[0], c[1] - solid.center[1], c[2] - solid.center[2]}, n[3];
-            double limit = reach[j] + solid.radius;
-            if (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] > limit * limit)
+            double d[3] = {c[0] - solid.center[0], c[1] - solid.center[1], c[2] - solid.center[2]}, normal[3];
+            double far = reach[j] + solid.radius, *jacobian = jacobians + 3 * n * j, *row = rows + n * found;
+            if (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] > far * far)
                 continue;
-            double distance = signed_distance(&solid, c, n);
-            if (!(distance <= reach[j]))
+            double room = signed_distance(&solid, c, normal);
+            if (!(room <= reach[j]))
                 continue;
-            double *value = values + 3 * found;
+            double approach = normal[0] * (v[0] + w[1] * d[2] - w[2] * d[1]) +
+                              normal[1] * (v[1] + w[2] * d[0] - w[0] * d[2]) +
+                              normal[2] * (v[2] + w[0] * d[1] - w[1] * d[0]);
+            room -= limit->reduced[j] + (margins ? margins[i] : 0.0);
+            if (limit->deviations > 0.0) {
+                double variance = 0.0;
+                for (int r = 0; r < 3; r++)
+                    variance += normal[r] * (P[3 * r] * normal[0] + P[3 * r + 1] * normal[1] + P[3 * r + 2] * normal[2]);
+                room -= limit->deviations * sqrt(variance > 0.0 ? variance : 0.0);
+            }
+            if (speeds[j] < 0.0) {
+                point_jacobian(jacobian, arm, c, arm->moves + n * j);
+                speeds[j] = fastest(jacobian, lower, upper, n);
+            }
+            if (bound_of_bounds(limit, room, approach, delays[i], braking) < -speeds[j] - ROUNDING)
+                continue;
+            along(row, jacobian, normal, n);
+            double least = bound(limit, row, n, room, approach, delays[i], braking);
+            if (!violable(row, n, least, lower, upper) || (least > 0.0 && unmoved(row, n, limit->unmoved)))
+                continue;
             indices[2 * found] = i;
             indices[2 * found + 1] = j;
-            value[0] = distance;
-            value[1] = n[0] * (v[0] + w[1] * d[2] - w[2] * d[1]) + n[1] * (v[1] + w[2] * d[0] - w[0] * d[2]) +
-                       n[2] * (v[2] + w[0] * d[1] - w[1] * d[0]);
-            value[2] = 0.0;
-            for (int r = 0; r < 3; r++)
-                value[2] += n[r] * (P[3 * r] * n[0] + P[3 * r + 1] * n[1] + P[3 * r + 2] * n[2]);
-            speeds(rows + arm->n * found, arm, c, n, arm->moves + arm->n * j, 0);
+            values[2 * found] = room;
+            values[2 * found + 1] = least;
             found++;
         }
     }
@@ -92,27 +190,41 @@ typedef struct {
     const int64_t *starts;
 } SpherePairs;
 
-/* Find every pair nearer than close, at most the nearest `most`, and the nearest pair of each of the n_rows nearest
+/* Find every pair nearer than close, at most the nearest `most`, and the nearest pair of each of the n_groups nearest
  * groups that are nearer than near.
  *
- * centers (m, 3): first those of the arm, which has moves, then those of the base. scratch: room for n_pairs + n_groups
- * pairs. Out: the pairs' indices in SpherePairs, ordered by distance, their distances, and their rows (n each).
- * Returns their number, at most most + n_rows. */
-int64_t self_rows(const SpherePairs *pairs, const Arm *arm, const double *centers, int64_t n_rows, double near,
-                  double close, int64_t most, Pair *scratch, int64_t *indices, double *distances, double *rows)
+ * centers (m, 3) of the arm's spheres, base_centers of those that follow them in the numbers of spheres. scratch: room
+ * for n_pairs + n_groups pairs. Out: the pairs' indices in SpherePairs, ordered by distance, their distances, and their
+ * rows (n each). Returns their number, at most most + n_groups.
+ *
+ * The distance less the clearance may shrink by gain (1/s) times itself; if it is negative, it must grow by retreat
+ * times its magnitude. If no velocity between lower and upper (n) violates this for any pair, the result is 0. If lower
+ * is null, this is not tested. */
+int64_t self_rows(const SpherePairs *pairs, const Arm *arm, const double *centers, const double *base_centers,
+                  int64_t n_groups, double near, double close, int64_t most, double clearance, double gain,
+                  double retreat, const double *lower, const double *upper, Pair *scratch, int64_t *indices,
+                  double *distances, double *rows)
 {
     Pair *best = scratch, *chosen = scratch + pairs->n_groups;
-    int64_t n_close = 0, found = 0;
+    int64_t n_close = 0, found = 0, n = arm->n;
+    int effect = !lower;
+    double jacobian[3 * MAX_JOINTS], moves[MAX_JOINTS];
     for (int64_t g = 0; g < pairs->n_groups; g++) {
         int64_t end = g + 1 < pairs->n_groups ? pairs->starts[g + 1] : pairs->n_pairs;
+        double nearest = near;
         best[g].distance = INFINITY;
         best[g].index = pairs->starts[g];
         for (int64_t k = pairs->starts[g]; k < end; k++) {
-            const double *a = centers + 3 * pairs->outer[k], *b = centers + 3 * pairs->inner[k];
-            double x = a[0] - b[0], y = a[1] - b[1], z = a[2] - b[2];
-            double distance = sqrt(x * x + y * y + z * z) - pairs->sums[k];
-            if (distance < best[g].distance) {
-                best[g].distance = distance;
+            int64_t inner = pairs->inner[k];
+            const double *a = centers + 3 * pairs->outer[k];
+            const double *b = inner < arm->m ? centers + 3 * inner : base_centers + 3 * (inner - arm->m);
+            double x = a[0] - b[0], y = a[1] - b[1], z = a[2] - b[2], sum = pairs->sums[k];
+            double squared = x * x + y * y + z * z, within = sum + (nearest > close ? nearest : close);
+            if (within < 0.0 || squared > within * within * (1.0 + 1e-12))
+                continue;
+            double distance = sqrt(squared) - sum;
+            if (distance < nearest) {
+                nearest = best[g].distance = distance;
                 best[g].index = k;
             }
             if (distance < close) {
@@ -124,7 +236,7 @@ int64_t self_rows(const SpherePairs *pairs, const Arm *arm, const double *center
     qsort(best, (size_t)pairs->n_groups, sizeof(Pair), nearer);
     qsort(chosen, (size_t)n_close, sizeof(Pair), nearer);
     int64_t kept = n_close < most ? n_close : most;
-    for (int64_t g = 0; g < n_rows && g < pairs->n_groups && best[g].distance < near; g++) {
+    for (int64_t g = 0; g < n_groups && g < pairs->n_groups && best[g].distance < near; g++) {
         int known = 0;
         for (int64_t k = 0; k < kept && !known; k++)
             known = chosen[k].index == best[g].index;
@@ -133,15 +245,20 @@ int64_t self_rows(const SpherePairs *pairs, const Arm *arm, const double *center
     }
     for (int64_t k = 0, a = 0, b = 0; k < kept + found; k++) { /* merge both, which are in order */
         Pair pair = b >= found || (a < kept && nearer(chosen + a, best + b) < 0) ? chosen[a++] : best[b++];
-        const double *one = centers + 3 * pairs->outer[pair.index], *other = centers + 3 * pairs->inner[pair.index];
+        int64_t outer = pairs->outer[pair.index], inner = pairs->inner[pair.index];
+        const double *one = centers + 3 * outer;
+        const double *other = inner < arm->m ? centers + 3 * inner : base_centers + 3 * (inner - arm->m);
         double length = pair.distance + pairs->sums[pair.index], normal[3];
-        const double *moved = arm->moves + arm->n * pairs->outer[pair.index];
-        const double *inner = pairs->inner[pair.index] < arm->m ? arm->moves + arm->n * pairs->inner[pair.index] : 0;
-        for (int c = 0; c < 3; c++)
+        for (int64_t c = 0; c < 3; c++)
             normal[c] = (one[c] - other[c]) / length;
+        for (int64_t c = 0; c < n; c++) /* joints that move both spheres do not change their distance */
+            moves[c] = arm->moves[n * outer + c] - (inner < arm->m ? arm->moves[n * inner + c] : 0.0);
+        point_jacobian(jacobian, arm, one, moves);
+        along(rows + n * k, jacobian, normal, n);
         indices[k] = pair.index;
         distances[k] = pair.distance;
-        speeds(rows + arm->n * k, arm, one, normal, moved, inner);
+        double room = pair.distance - clearance;
+        effect = effect || violable(rows + n * k, n, (room < 0.0 ? -retreat : -gain) * room, lower, upper);
     }
-    return kept + found;
+    return effect ? kept + found : 0;
 }

@@ -22,8 +22,8 @@ _OPTIONS = ("-O2", "-std=c11", "-ffp-contract=off", "-shared", "-fPIC")
 _I, _P, _D = ctypes.c_int64, ctypes.c_void_p, ctypes.c_double
 _FUNCTIONS: dict[str, tuple[Any, ...]] = {
     "imitarm_sources": (),
-    "obstacle_rows": (_P, _D, _P, _P, _P, _P, _P, _P),
-    "self_rows": (_P, _P, _P, _I, _D, _D, _I, _P, _P, _P, _P),
+    "obstacle_rows": (_P, _D, _P, _P, _P, _P, _P, _P, _D, _P, _P, _P, _P, _P, _P),
+    "self_rows": (_P, _P, _P, _P, _I, _D, _D, _I, _D, _D, _D, _P, _P, _P, _P, _P, _P),
     "track_kernel_update": (_I, _I, _I, _D, _D, _D, _D, _P, _P, _P, _P),
 }
 
@@ -64,7 +64,9 @@ def address(array: NDArray[Any]) -> int:
 
 
 class Record:
-    """A C structure whose fields are whole numbers of 64 bits, addresses of arrays, and lists of addresses of records.
+    """A C structure of whole numbers (``int64_t``), real numbers (``double``), arrays, and lists of other structures.
+
+    Arrays are given by their addresses, and lists by the address of a list of addresses, 0 for None.
 
     The record keeps its fields. A copy in another process has addresses of its own.
 
@@ -72,7 +74,7 @@ class Record:
         address: address of the structure.
     """
 
-    def __init__(self, *fields: int | NDArray[Any] | Sequence[Record | None]) -> None:
+    def __init__(self, *fields: int | float | NDArray[Any] | Sequence[Record | None]) -> None:
         """Write the fields in order; an array of another type or layout than C has must not be given."""
         self._fields = fields
         values: list[int] = []
@@ -80,6 +82,8 @@ class Record:
         for field in fields:
             if isinstance(field, int):
                 values.append(field)
+            elif isinstance(field, float):
+                values.append(int(np.float64(field).view(np.int64)))
             elif isinstance(field, np.ndarray):
                 values.append(address(field))
             else:

@@ -82,7 +82,7 @@ class ArmMemory:
         force: generalised forces, shape (nv,).
         centers: centres of the spheres that cover the arm, once they have been computed for the posture.
         n_joints: number of the arm's joints.
-        kept: arrays that compiled code uses again in every step, by name.
+        kept: memory that compiled code uses again in every step, by purpose.
     """
 
     def __init__(

@@ -46,6 +46,12 @@ class Rows(NamedTuple):
     price: float = math.inf
 
 
+def violable(matrix: Array, lower: Array, box: Box) -> NDArray[np.bool_]:
+    """Return for each row ``matrix @ v >= lower`` whether any velocity v in a box violates it, shape (k,)."""
+    middle, half = 0.5 * (box.lower + box.upper), 0.5 * (box.upper - box.lower)
+    return np.asarray(lower > matrix.dot(middle) - np.abs(matrix).dot(half))
+
+
 class TaskRows(NamedTuple):
     """The rows of a task at one step: ``jacobian @ v`` should equal ``target``; both are already weighted.
 

@@ -16,79 +16,65 @@ from numpy.typing import NDArray
 from imitarm.compiled import library
 from imitarm.compiled.kernels import Record, address
 from imitarm.kinematics.arm_kinematics import ArmMemory
+from imitarm.kinematics.ik_problem import Box, Rows
 from imitarm.kinematics.spheres import SphereCover
 from imitarm.scene.convex_hull import Polytope
-from imitarm.scene.distances import PackedObstacles, near_pairs
+from imitarm.scene.distances import PackedObstacles
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 
-class ObstacleRows(NamedTuple):
-    """Pairs of a sphere of the arm and an obstacle that are near each other.
+class NearRows(NamedTuple):
+    """Rows of a clearance limit, and the pair of a sphere and an obstacle to which each belongs.
 
     Attributes:
+        rows: inequalities on the joint velocity.
         obstacle: index of the obstacle, shape (k,).
-        sphere: index of the sphere, shape (k,).
-        distance: signed distance of the sphere's centre to the obstacle, shape (k,) [m].
-        approach: speed of the obstacle's nearest point along the normal, shape (k,) [m/s].
-        variance: variance of the obstacle's position along the normal, shape (k,) [m^2].
-        gradient: derivatives of the distance with respect to the joints, shape (k, n_joints) [m/rad].
+        sphere: index of the sphere of the arm, shape (k,).
+        room: remaining distance h, shape (k,) [m].
     """
 
+    rows: Rows
     obstacle: Indices
     sphere: Indices
-    distance: Array
-    approach: Array
-    variance: Array
-    gradient: Array
+    room: Array
 
 
-def obstacle_rows(
-    cover: SphereCover, memory: ArmMemory, packed: PackedObstacles, centers: Array, reach: Array
-) -> ObstacleRows:
-    """Return all pairs of a sphere and an obstacle that are at most ``reach`` apart.
+def compiled_near_rows(
+    limit: Record,
+    cover: SphereCover,
+    memory: ArmMemory,
+    packed: PackedObstacles,
+    arrays: tuple[Array, Array, Array | None, Array],
+    braking: float,
+    box: Box,
+) -> NearRows | None:
+    """Return the rows of ``ClearanceLimit`` by compiled code, which must have been built; None if there is none.
 
     Args:
+        limit: the C structure ``Limit``.
         cover: spheres that cover the arm.
         memory: the kinematics of the posture.
         packed: n obstacles.
-        centers: centres of the spheres in the base frame, shape (m, 3) [m].
-        reach: largest distance for each sphere, shape (m,) [m]; passing the same array in every call saves time.
+        arrays: centres of the m spheres (m, 3) [m]; distance of each centre within which obstacles have rows (m,) [m];
+            distance added to the clearance of each obstacle (n,) [m], or None; delay of the commands plus the age of
+            each obstacle (n,) [s]. All are contiguous.
+        braking: time in which the joints can brake to rest [s].
+        box: bounds of the joint velocity; rows that no velocity within them violates are left out.
     """
-    kernel = library()
-    if kernel is None:
-        return _obstacle_rows_by_numpy(cover, memory, packed, centers, reach)
+    centers, reach, margins, delays = arrays
     record, dt = _record_of(packed)
-    room = _room(memory, "obstacle_rows", len(packed) * len(reach))
-    places = record.address, dt, _arm_record(cover, memory).address, address(centers), address(reach)
-    k = kernel.obstacle_rows(*places, *room.addresses)
+    room = _room(memory, "near rows", len(packed) * len(reach), (3 * memory.n_joints + 1) * len(reach))
+    places = record.address, dt, _arm_record(cover, memory).address, address(centers), address(reach), limit.address
+    more = None if margins is None else address(margins), address(delays)
+    bounds = address(box.lower), address(box.upper)
+    k = library().obstacle_rows(*places, *more, braking, *bounds, *room.addresses)
+    if not k:
+        return None
     obstacle, sphere = room.indices[:k].T.copy()
-    distance, approach, variance = room.values[:k].T.copy()
-    return ObstacleRows(obstacle, sphere, distance, approach, variance, room.rows[:k].copy())
-
-
-def _obstacle_rows_by_numpy(
-    cover: SphereCover, memory: ArmMemory, packed: PackedObstacles, centers: Array, reach: Array
-) -> ObstacleRows:
-    pairs = near_pairs(packed, centers, reach)
-    if pairs is None:
-        whole, empty = np.zeros(0, dtype=np.intp), np.zeros(0)
-        return ObstacleRows(whole, whole, empty, empty, empty, np.zeros((0, memory.n_joints)))
-    obstacle, sphere, distance, normal = pairs
-    points = centers.take(sphere, axis=0).T
-    approach = variance = np.zeros(len(obstacle))
-    if not packed.still:
-        velocity = packed.velocities.take(obstacle, axis=0).T
-        if packed.rotating:  # the nearest surface point p moves at v + w x (p - origin); c - p is along n
-            arms = points - packed.positions.take(obstacle, axis=0).T
-            velocity = velocity + np.cross(packed.angular_velocities.take(obstacle, axis=0).T, arms, axis=0)
-        approach = np.einsum("ij,ij->j", velocity, normal)
-    if packed.covariances.any():
-        variance = np.einsum("ik,kij,jk->k", normal, packed.covariances.take(obstacle, axis=0), normal)
-    return ObstacleRows(
-        obstacle, sphere, distance, approach, variance, cover.speeds(memory.data, sphere, points, normal)
-    )
+    remaining, lower = room.values[:k].T.copy()
+    return NearRows(Rows(room.rows[:k].copy(), lower), obstacle, sphere, remaining)
 
 
 class OwnRows(NamedTuple):
@@ -105,101 +91,142 @@ class OwnRows(NamedTuple):
     gradient: Array
 
 
+class Nearness(NamedTuple):
+    """Which pairs of spheres are near.
+
+    Every pair closer than ``close`` is near, but at most the ``most`` closest ones. So is the closest pair of each of
+    the ``n_groups`` closest groups, if this pair is closer than ``within``.
+
+    Attributes:
+        n_groups: see above.
+        within: see above [m].
+        close: see above [m].
+        most: see above.
+    """
+
+    n_groups: int
+    within: float
+    close: float
+    most: int
+
+
+class Demand(NamedTuple):
+    """The inequality for each pair: its distance may shrink by ``gain`` times what exceeds the clearance.
+
+    Attributes:
+        clearance: [m].
+        gain: [1/s].
+        retreat: replaces ``gain`` while the distance is below the clearance [1/s].
+    """
+
+    clearance: float
+    gain: float
+    retreat: float
+
+
 @dataclass(frozen=True, eq=False)
 class SpherePairs:
     """Pairs of spheres of an arm, grouped by the two links to which the spheres belong.
 
     Attributes:
+        cover: the spheres.
         outer: index of the sphere that is farther from the base, shape (k,).
         inner: index of the other sphere; those of the base follow those of the arm, shape (k,).
         sums: sum of the two radii, shape (k,) [m].
         starts: first pair of each group, shape (g,).
     """
 
+    cover: SphereCover
     outer: NDArray[np.int64]
     inner: NDArray[np.int64]
     sums: Array
     starts: NDArray[np.int64]
 
     @cached_property
-    def record(self) -> Record:
+    def _record(self) -> Record:
         """The C structure of the same name."""
         return Record(len(self.sums), len(self.starts), self.outer, self.inner, self.sums, self.starts)
 
     def distances(self, centers: Array) -> Array:
-        """Return the distances of all pairs, shape (k,) [m]; ``centers`` (m, 3) [m] are those of all spheres."""
-        between = centers.take(self.outer, axis=0) - centers.take(self.inner, axis=0)
+        """Return the distances of all pairs, shape (k,) [m]; ``centers`` (m, 3) [m] are those of the arm's spheres."""
+        every = np.concatenate([centers, self.cover.base_centers])
+        between = every.take(self.outer, axis=0) - every.take(self.inner, axis=0)
         between *= between
         squares = between[:, 0] + between[:, 1]
         squares += between[:, 2]
         return np.asarray(np.sqrt(squares, out=squares) - self.sums)
 
     def rows(
-        self, cover: SphereCover, memory: ArmMemory, centers: Array, n_groups: int, near: float, close: float, most: int
-    ) -> OwnRows:
-        """Return the near pairs.
-
-        Every pair closer than ``close`` is near, but at most the ``most`` closest ones. So is the closest pair of each
-        of the ``n_groups`` closest groups, if this pair is closer than ``near``.
+        self, memory: ArmMemory, centers: Array, nearness: Nearness, demand: Demand, box: Box | None = None
+    ) -> OwnRows | None:
+        """Return the near pairs; None if there is none.
 
         Args:
-            cover: spheres that cover the arm.
             memory: the kinematics of the posture.
-            centers: centres of all spheres, with those of the base last, shape (m, 3) [m].
-            n_groups: see above.
-            near: see above [m].
-            close: see above [m].
-            most: see above.
+            centers: centres of the arm's spheres, shape (m, 3) [m].
+            nearness: which pairs are near.
+            demand: the inequality for each pair.
+            box: bounds of the joint velocity; if no velocity within them violates any inequality, the result may be
+                None.
         """
         kernel = library()
         if kernel is None:
-            return self._rows_by_numpy(cover, memory, centers, n_groups, near, close, most)
-        room = _room(memory, "own_rows", most + n_groups)
-        scratch = memory.kept.get("pairs")
-        if scratch is None or len(scratch) < len(self.sums) + len(self.starts):
-            scratch = memory.kept["pairs"] = np.empty((len(self.sums) + len(self.starts), 2))
-        places = self.record.address, _arm_record(cover, memory).address, address(centers)
-        indices, distances, rows = room.addresses
-        k = kernel.self_rows(*places, n_groups, near, close, most, address(scratch), indices, distances, rows)
+            return self._rows_by_numpy(memory, centers, nearness)
+        n_groups, _, _, most = nearness
+        room = _room(memory, "own rows", most + n_groups, 2 * (len(self.sums) + len(self.starts)))
+        arm, base = _arm_record(self.cover, memory).address, self.cover.base_centers
+        bounds = (None, None) if box is None else (address(box.lower), address(box.upper))
+        places = self._record.address, arm, address(centers), address(base)
+        k = kernel.self_rows(*places, *nearness, *demand, *bounds, *room.addresses)
+        if not k:
+            return None
         return OwnRows(room.indices.ravel()[:k].copy(), room.values.ravel()[:k].copy(), room.rows[:k].copy())
 
-    def _rows_by_numpy(
-        self, cover: SphereCover, memory: ArmMemory, centers: Array, n_groups: int, near: float, close: float, most: int
-    ) -> OwnRows:
+    def _rows_by_numpy(self, memory: ArmMemory, centers: Array, nearness: Nearness) -> OwnRows | None:
         distances, starts = self.distances(centers), self.starts
         chosen: set[int] = set()
         if len(starts):
             ends = [*starts.tolist(), len(distances)][1:]
             least = np.minimum.reduceat(distances, starts)
-            for group in least.argsort(kind="stable")[:n_groups].tolist():
-                if least[group] < near:
+            for group in least.argsort(kind="stable")[: nearness.n_groups].tolist():
+                if least[group] < nearness.within:
                     start = int(starts[group])
                     chosen.add(start + int(distances[start : ends[group]].argmin()))
-            within = (distances < close).nonzero()[0]
-            chosen.update(within.take(distances.take(within).argsort(kind="stable")[:most]).tolist())
+            close = (distances < nearness.close).nonzero()[0]
+            chosen.update(close.take(distances.take(close).argsort(kind="stable")[: nearness.most]).tolist())
+        if not chosen:
+            return None
         pairs = np.array(sorted(chosen), dtype=np.int64)
         pairs = pairs.take(distances.take(pairs).argsort(kind="stable"))
         outer, inner, distance = self.outer.take(pairs), self.inner.take(pairs), distances.take(pairs)
-        points = centers.take(outer, axis=0)
-        normals = (points - centers.take(inner, axis=0)) / (distance + self.sums.take(pairs))[:, None]
-        return OwnRows(pairs, distance, cover.parting(memory.data, outer, inner, points, normals))
+        every = np.concatenate([centers, self.cover.base_centers])
+        points = every.take(outer, axis=0)
+        normals = (points - every.take(inner, axis=0)) / (distance + self.sums.take(pairs))[:, None]
+        return OwnRows(pairs, distance, self.cover.parting(memory.data, outer, inner, points, normals))
 
 
 class _Room:
-    """Memory for the results of compiled code, used again in every step."""
+    """Memory for compiled code, used again in every step.
 
-    def __init__(self, size: int, n_joints: int) -> None:
-        self.size = size
+    Attributes:
+        indices: shape (size, 2).
+        values: shape (size, 2).
+        rows: shape (size, n_joints).
+        scratch: shape (n_scratch,).
+        addresses: of these four, beginning with ``scratch``.
+    """
+
+    def __init__(self, size: int, n_joints: int, n_scratch: int) -> None:
         self.indices = np.empty((size, 2), dtype=np.int64)
-        self.values, self.rows = np.empty((size, 3)), np.empty((size, n_joints))
-        self.addresses = address(self.indices), address(self.values), address(self.rows)
+        self.values, self.rows, self.scratch = np.empty((size, 2)), np.empty((size, n_joints)), np.empty(n_scratch)
+        self.addresses = [address(array) for array in (self.scratch, self.indices, self.values, self.rows)]
 
 
-def _room(memory: ArmMemory, name: str, size: int) -> _Room:
+def _room(memory: ArmMemory, purpose: str, size: int, n_scratch: int) -> _Room:
     """Return memory for at least ``size`` rows, of this arm in this thread."""
-    room: _Room | None = memory.kept.get(name)
-    if room is None or room.size < size:
-        room = memory.kept[name] = _Room(size, memory.n_joints)
+    room: _Room | None = memory.kept.get(purpose)
+    if room is None or len(room.rows) < size or len(room.scratch) < n_scratch:
+        room = memory.kept[purpose] = _Room(size, memory.n_joints, n_scratch)
     return room
 
 

@@ -23,7 +23,8 @@ APPROACH_RATE = 6.0
 """A distance to an obstacle never shrinks by more than this fraction of itself per second [1/s]."""
 LONGEST_YIELD = 1.5
 """The arm begins to yield to an obstacle at most this time before it would be touched, times one half [s]."""
-_SHARE = 0.1  # of the acceleration along the normal that all joints together could give to one part of the arm
+SHARE = 0.1
+"""Only this fraction is counted of the acceleration that all joints together could give to a part of the arm."""
 
 
 def shrink_rates(
@@ -65,7 +66,7 @@ def shrink_rates(
     if approach is None or approach.max(initial=0.0) <= 0.0:
         return np.minimum(most, 1.0 / (delay + 0.5 * time))
     reach = np.abs(gradients)
-    times = approach / np.maximum(_SHARE * (reach @ arm.max_acceleration), 1e-9)
+    times = approach / np.maximum(SHARE * (reach @ arm.max_acceleration), 1e-9)
     times[(approach <= 0.0) | (approach > reach @ arm.max_velocity)] = 0.0
     times = np.maximum(np.minimum(times, LONGEST_YIELD), time)
     return np.minimum(most, 1.0 / (delay + 0.5 * times))

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.ik_problem import Rows
+from imitarm.kinematics.ik_problem import Box, Rows, violable
 from imitarm.kinematics.spheres import COLLISION_GROUP
-from imitarm.scene.arm_rows import OwnRows, SpherePairs
+from imitarm.scene.arm_rows import Demand, Nearness, OwnRows, SpherePairs
 from imitarm.validation import finite_number, instance, whole_number
 
 Array = NDArray[np.float64]
@@ -67,9 +67,10 @@ class SelfClearance:
         gain = finite_number(gain, "SelfClearance: gain", "1/s", above=0.0)
         instance(arm, ArmModel, "SelfClearance: arm")
         self.arm, self.clearance = arm, clearance
-        self._n_rows, self._gain = n_rows, gain
+        self._gain = gain
         cover = arm.cover
-        centers, radii = self._centers(arm.home), np.concatenate([cover.radii, cover.base_radii])
+        centers = np.concatenate([arm.sphere_centers(arm.home), cover.base_centers])
+        radii = np.concatenate([cover.radii, cover.base_radii])
         links = self.links = np.concatenate([cover.links, np.zeros(len(cover.base_radii), dtype=int)])
         meet = meeting_links(arm)
         sums = radii[:, None] + radii
@@ -79,12 +80,9 @@ class SelfClearance:
         pair_of_links = links[outer] * (arm.n_joints + 1) + links[inner]
         order = np.argsort(pair_of_links, kind="stable")
         starts = np.flatnonzero(np.diff(pair_of_links[order], prepend=-1))
-        self.pairs = SpherePairs(outer[order], inner[order], (radii[outer] + radii[inner])[order], starts)
-        self._near, self._close = clearance + _INFLUENCE, clearance + _NEAR
-
-    def _centers(self, q: ArrayLike) -> Array:
-        """Return the centres of all spheres, with the base's spheres last, shape (m, 3) [m]."""
-        return np.concatenate([self.arm.sphere_centers(q), self.arm.cover.base_centers])
+        self.pairs = SpherePairs(cover, outer[order], inner[order], (radii[outer] + radii[inner])[order], starts)
+        self._nearness = Nearness(n_rows, clearance + _INFLUENCE, clearance + _NEAR, _MOST)
+        self._demand = Demand(clearance, gain, _RETREAT_RATE)
 
     @property
     def n_pairs(self) -> int:
@@ -102,7 +100,7 @@ class SelfClearance:
         """
         if not self.n_pairs:
             return math.inf
-        return float(self.pairs.distances(self._centers(q)).min())
+        return float(self.pairs.distances(self.arm.sphere_centers(q)).min())
 
     def nearest(self, q: ArrayLike) -> tuple[Indices, Array]:
         """Return the pairs of spheres that are near enough to have a row in :meth:`rows`, nearest pair first.
@@ -114,6 +112,8 @@ class SelfClearance:
             indices of the two spheres (k, 2), and their distances (k,) [m].
         """
         found = self._found(q)
+        if found is None:
+            return np.zeros((0, 2), dtype=int), np.zeros(0)
         pairs = np.stack((self.pairs.outer.take(found.pair), self.pairs.inner.take(found.pair)), axis=1)
         return pairs, found.distance
 
@@ -129,17 +129,23 @@ class SelfClearance:
         first, second = (bodies[i] if i < len(bodies) else "base" for i in pairs[row].tolist())
         return first, second, float(distances[row]) - self.clearance
 
-    def rows(self, q: ArrayLike) -> Rows | None:
+    def rows(self, q: ArrayLike, box: Box | None = None) -> Rows | None:
         """Return inequalities on the joint velocity for ``solve_ik(..., rows=...)``.
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
+            box: bounds of the joint velocity; None: the rows are returned whatever the velocity is.
 
         Returns:
-            None when nothing is near.
+            None when nothing is near, or when no velocity in the box violates any inequality.
         """
-        found = self.near(q)
-        return None if found is None else Rows(found[0], self.lower(found[1]))
+        found = self._found(q, box)
+        if found is None:
+            return None
+        lower = self.lower(found.distance - self.clearance)
+        if box is not None and not violable(found.gradient, lower, box).any():
+            return None
+        return Rows(found.gradient, lower)
 
     def near(self, q: ArrayLike) -> tuple[Array, Array] | None:
         """Return gradients of the distances of near pairs (k, n_joints) [m/rad], and distance minus clearance (k,) [m].
@@ -150,8 +156,8 @@ class SelfClearance:
         Returns:
             None when nothing is near.
         """
-        _, distance, gradient = self._found(q)
-        return (gradient, distance - self.clearance) if len(distance) else None
+        found = self._found(q)
+        return None if found is None else (found.gradient, found.distance - self.clearance)
 
     def lower(self, room: Array) -> Array:
         """Return the least allowed rates (k,) [m/s] of distances; ``room`` (k,) [m] is distance minus clearance."""
@@ -163,10 +169,10 @@ class SelfClearance:
         """Return a version of this check that takes a fifth of its time, for a control loop with period ``dt`` [s]."""
         return PeriodicSelfClearance(self, dt)
 
-    def _found(self, q: ArrayLike) -> OwnRows:
+    def _found(self, q: ArrayLike, box: Box | None = None) -> OwnRows | None:
         """Return the nearest pairs."""
-        memory, centers = self.arm.at(q), self._centers(q)
-        return self.pairs.rows(self.arm.cover, memory, centers, self._n_rows, self._near, self._close, _MOST)
+        memory, centers = self.arm.at(q), self.arm.sphere_centers(q)
+        return self.pairs.rows(memory, centers, self._nearness, self._demand, box)
 
 
 class PeriodicSelfClearance:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from imitarm.compiled import library
+from imitarm.compiled.kernels import Record
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.ik_problem import Box, Rows
-from imitarm.scene.arm_rows import obstacle_rows
-from imitarm.scene.braking import APPROACH_RATE, LONGEST_YIELD, shrink_rates
-from imitarm.scene.distances import PackedObstacles
+from imitarm.kinematics.ik_problem import Box, Rows, violable
+from imitarm.scene.arm_rows import NearRows, compiled_near_rows
+from imitarm.scene.braking import APPROACH_RATE, LONGEST_YIELD, SHARE, shrink_rates
+from imitarm.scene.distances import PackedObstacles, near_pairs
 from imitarm.scene.scene import Scene
 from imitarm.validation import finite_number, instance
 
@@ -21,22 +24,6 @@ Indices = NDArray[np.int_]
 
 _STEP = 0.05  # [m] steps in which the distance is extended within which obstacles have rows
 _UNMOVED = 1e-6  # [m/rad] a joint that changes a distance by less does not change it
-
-
-class NearRows(NamedTuple):
-    """The rows of :class:`ClearanceLimit`, and the pair of a sphere and an obstacle to which each belongs.
-
-    Attributes:
-        rows: inequalities on the joint velocity.
-        obstacle: index of the obstacle, shape (k,).
-        sphere: index of the sphere of the arm, shape (k,).
-        room: remaining distance h, shape (k,) [m].
-    """
-
-    rows: Rows
-    obstacle: Indices
-    sphere: Indices
-    room: Array
 
 
 class ClearanceLimit:
@@ -138,19 +125,43 @@ class ClearanceLimit:
         packed = scene.packed
         if not len(packed):
             return None
-        memory, centers = self.arm.at(q), self.arm.sphere_centers(q)
-        found = obstacle_rows(self._cover, memory, packed, centers, self._reach(packed, margins))
-        obstacle, sphere, distance, approach, variance, matrix = found
-        if not len(obstacle):
+        speed = None if velocity is None else np.asarray(velocity, dtype=float)
+        within = self._free if box is None else box
+        if library() is None:
+            return self._near_by_numpy(q, scene, speed, margins, within)
+        memory, centers, reach = self.arm.at(q), self.arm.sphere_centers(q), self._reach(packed, margins)
+        if packed.still:
+            delays = np.full(len(packed), self.delay)
+        else:
+            delays = np.maximum(scene.stamp - packed.stamps, 0.0) + self.delay
+        braking = 0.0 if speed is None else float((np.abs(speed) / self.arm.max_acceleration).max())
+        arrays = centers, reach, margins, delays
+        return compiled_near_rows(self._record, self._cover, memory, packed, arrays, braking, within)
+
+    @cached_property
+    def _record(self) -> Record:
+        """The C structure ``Limit``."""
+        limits = self._reduced, self.arm.max_acceleration, self.arm.max_velocity
+        return Record(*limits, self.rate, self.retreat_rate, self.deviations, SHARE, LONGEST_YIELD, _UNMOVED)
+
+    def _near_by_numpy(
+        self, q: ArrayLike, scene: Scene, velocity: Array | None, margins: Array | None, box: Box
+    ) -> NearRows | None:
+        packed, data, centers = scene.packed, self.arm.at(q).data, self.arm.sphere_centers(q)
+        pairs = near_pairs(packed, centers, self._reach(packed, margins))
+        if pairs is None:
             return None
+        obstacle, sphere, distance, normal = pairs
+        points = centers.take(sphere, axis=0).T
+        matrix = self._cover.speeds(data, sphere, points, normal)
         room = distance - self._reduced.take(sphere)
         if margins is not None:
             room -= margins.take(obstacle)
-        if self.deviations:
-            room -= self.deviations * np.sqrt(np.maximum(variance, 0.0))
-        speed = None if velocity is None else np.asarray(velocity, dtype=float)
-        pairs = _Pairs(obstacle, sphere, room, None if packed.still else approach)
-        return self._rows(scene, matrix, pairs, speed, self._free if box is None else box)
+        if self.deviations and packed.covariances.any():
+            spread = np.einsum("ik,kij,jk->k", normal, packed.covariances.take(obstacle, axis=0), normal)
+            room -= self.deviations * np.sqrt(np.maximum(spread, 0.0))
+        approach = _approach(packed, obstacle, points, normal)
+        return self._rows(scene, matrix, _Pairs(obstacle, sphere, room, approach), velocity, box)
 
     def _reach(self, packed: PackedObstacles, margins: Array | None) -> Array:
         """Return the distance of each sphere's centre within which obstacles have rows; the same array if possible."""
@@ -212,7 +223,12 @@ class _Pairs(NamedTuple):
         return _Pairs(self.obstacle[kept], self.sphere[kept], self.room[kept], approach)
 
 
-def violable(matrix: Array, lower: Array, box: Box) -> NDArray[np.bool_]:
-    """Return for each row ``matrix @ v >= lower`` whether any velocity v in a box violates it, shape (k,)."""
-    middle, half = 0.5 * (box.lower + box.upper), 0.5 * (box.upper - box.lower)
-    return np.asarray(lower > matrix.dot(middle) - np.abs(matrix).dot(half))
+def _approach(packed: PackedObstacles, obstacle: Indices, points: Array, normal: Array) -> Array | None:
+    """Return the speed of each obstacle's nearest point along the normal, shape (k,) [m/s]; None if none moves."""
+    if packed.still:
+        return None
+    velocity = packed.velocities.take(obstacle, axis=0).T
+    if packed.rotating:  # the nearest surface point p moves at v + w x (p - origin); c - p is along n
+        arms = points - packed.positions.take(obstacle, axis=0).T
+        velocity = velocity + np.cross(packed.angular_velocities.take(obstacle, axis=0).T, arms, axis=0)
+    return np.asarray(np.einsum("ij,ij->j", velocity, normal))
