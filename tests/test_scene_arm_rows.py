@@ -85,9 +85,9 @@ def test_both_ways_find_the_same_links(seed, name):
     assert (one is None) == (other is None)
     if one is None:
         return
-    np.testing.assert_array_equal(one.pair, other.pair)
     np.testing.assert_allclose(other.distance, one.distance, rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(other.gradient, one.gradient, rtol=0.0, atol=1e-9)
+    same = one.pair == other.pair  # of several pairs with the same distance, rounding chooses
+    np.testing.assert_allclose(other.gradient[same], one.gradient[same], rtol=0.0, atol=1e-9)
 
 
 def test_gradients_are_derivatives_of_the_distances():

@@ -201,7 +201,7 @@ class SafetyFilter:
         """Return bounds that contain every joint velocity that the acceleration limits allow after ``velocity``."""
         if not self._accelerates:
             return None
-        before = np.clip(velocity, -self.arm.max_velocity, self.arm.max_velocity)
+        before = np.minimum(np.maximum(velocity, -self.arm.max_velocity), self.arm.max_velocity)
         return Box(before - self._change, before + self._change)
 
     def _admits(self, q: Array, wanted: Array, velocity: Array | None, rows: list[Rows]) -> bool:

@@ -13,13 +13,28 @@
 /* An arm in one posture: m spheres, each moved by some of the n joints.
  *
  * moves (m, n): 1 where a joint moves a sphere, else 0; dofs (n): rows of cdof, MuJoCo's twists of the joints about
- * the centre of mass com. */
+ * the centre of mass com; owners (m), local (m, 3): body and local place of each sphere; rotations, origins: MuJoCo's
+ * poses of all bodies. */
 typedef struct {
     int64_t n, m;
     const double *moves;
     const int64_t *dofs;
     const double *cdof, *com;
+    const int64_t *owners;
+    const double *local, *rotations, *origins;
 } Arm;
+
+/* Centres of the spheres, shape (m, 3). */
+int64_t sphere_centers(const Arm *arm, double *centers)
+{
+    for (int64_t j = 0; j < arm->m; j++) {
+        const double *R = arm->rotations + 9 * arm->owners[j], *p = arm->origins + 3 * arm->owners[j];
+        const double *x = arm->local + 3 * j;
+        for (int r = 0; r < 3; r++)
+            centers[3 * j + r] = p[r] + (R[3 * r] * x[0] + R[3 * r + 1] * x[1] + R[3 * r + 2] * x[2]);
+    }
+    return 0;
+}
 
 /* Velocity of a point for a unit velocity of each joint, shape (n, 3); 0 for joints whose factor in moves is 0. */
 static void point_jacobian(double *jacobian, const Arm *arm, const double *point, const double *moves)
@@ -58,8 +73,17 @@ static double fastest(const double *jacobian, const double *lower, const double 
  * reduced (m); accelerations, velocities (n): limits of the joints. */
 typedef struct {
     const double *reduced, *accelerations, *velocities;
-    double rate, retreat, deviations, share, longest, unmoved;
+    double delay, rate, retreat, deviations, share, longest, unmoved;
 } Limit;
+
+/* Time in which the joints can brake to rest; a null velocity is at rest. */
+static double braking_time(const Limit *limit, const double *velocity, int64_t n)
+{
+    double longest = 0.0;
+    for (int64_t k = 0; velocity && k < n; k++)
+        longest = fmax(longest, fabs(velocity[k]) / limit->accelerations[k]);
+    return longest;
+}
 
 /* The least allowed derivative of the remaining distance `room`, when the obstacle approaches at a speed. */
 static double bound(const Limit *limit, const double *row, int64_t n, double room, double approach, double delay,
@@ -111,24 +135,29 @@ static int unmoved(const double *row, int64_t n, double least)
 
 /* Find the rows of all pairs of an obstacle and a sphere that are within the reach of the sphere.
  *
- * centers (m, 3); reach (m). margins, delays: of each obstacle; margins may be null. braking: time in which the joints
- * can brake to rest. lower, upper (n): bounds of the joint velocity; rows that no velocity within them violates are left
- * out. scratch: 3 n + 1 numbers for each sphere. Out: for each of at most n_obstacles * m rows, the indices of obstacle
- * and sphere (2 each), the remaining distance and the least allowed derivative (2 each), and the row (n each). Returns
- * their number. */
-int64_t obstacle_rows(const Obstacles *obstacles, double dt, const Arm *arm, const double *centers, const double *reach,
-                      const Limit *limit, const double *margins, const double *delays, double braking,
+ * dt: time from the poses of the obstacles to now, which is at time `time`. centers (m, 3); reach (m). margins: of each
+ * obstacle, may be null. velocity (n) of the joints, may be null. lower, upper (n): bounds of the next velocity; rows
+ * that no velocity within them violates are left out. scratch: 3 n + 1 numbers for each sphere. Out: for each of at most
+ * n_obstacles * m rows, the indices of obstacle and sphere (2 each), the remaining distance and the least allowed
+ * derivative (2 each), and the row (n each). Returns their number. */
+int64_t obstacle_rows(const Obstacles *obstacles, double dt, double time, const Arm *arm, const double *centers,
+                      const double *reach, const Limit *limit, const double *margins, const double *velocity,
                       const double *lower, const double *upper, double *scratch, int64_t *indices, double *values,
                       double *rows)
 {
     int64_t found = 0, n = arm->n;
     double *jacobians = scratch, *speeds = scratch + 3 * n * arm->m; /* a negative speed is not known yet */
+    double braking = braking_time(limit, velocity, n);
+    int still = 1;
     Solid solid;
+    for (int64_t i = 0; i < 3 * obstacles->n; i++)
+        still = still && obstacles->velocities[i] == 0.0 && obstacles->rates[i] == 0.0;
     for (int64_t j = 0; j < arm->m; j++)
         speeds[j] = -1.0;
     for (int64_t i = 0; i < obstacles->n; i++) {
         const double *v = obstacles->velocities + 3 * i, *w = obstacles->rates + 3 * i;
         const double *P = obstacles->covariances + 9 * i;
+        double delay = limit->delay + (still ? 0.0 : fmax(time - obstacles->stamps[i], 0.0));
         place(&solid, obstacles, i, dt);
         for (int64_t j = 0; j < arm->m; j++) {
             const double *c = centers + 3 * j;
@@ -153,10 +182,10 @@ int64_t obstacle_rows(const Obstacles *obstacles, double dt, const Arm *arm, con
                 point_jacobian(jacobian, arm, c, arm->moves + n * j);
                 speeds[j] = fastest(jacobian, lower, upper, n);
             }
-            if (bound_of_bounds(limit, room, approach, delays[i], braking) < -speeds[j] - ROUNDING)
+            if (bound_of_bounds(limit, room, approach, delay, braking) < -speeds[j] - ROUNDING)
                 continue;
             along(row, jacobian, normal, n);
-            double least = bound(limit, row, n, room, approach, delays[i], braking);
+            double least = bound(limit, row, n, room, approach, delay, braking);
             if (!violable(row, n, least, lower, upper) || (least > 0.0 && unmoved(row, n, limit->unmoved)))
                 continue;
             indices[2 * found] = i;

@@ -22,9 +22,10 @@ _OPTIONS = ("-O2", "-std=c11", "-ffp-contract=off", "-shared", "-fPIC")
 _I, _P, _D = ctypes.c_int64, ctypes.c_void_p, ctypes.c_double
 _FUNCTIONS: dict[str, tuple[Any, ...]] = {
     "imitarm_sources": (),
-    "obstacle_rows": (_P, _D, _P, _P, _P, _P, _P, _P, _D, _P, _P, _P, _P, _P, _P),
-    "self_rows": (_P, _P, _P, _P, _I, _D, _D, _I, _D, _D, _D, _P, _P, _P, _P, _P, _P),
-    "track_kernel_update": (_I, _I, _I, _D, _D, _D, _D, _P, _P, _P, _P),
+    "obstacle_rows": (_P, _D, _D, *[_P] * 12),
+    "sphere_centers": (_P, _P),
+    "self_rows": (*[_P] * 4, _I, _D, _D, _I, _D, _D, _D, *[_P] * 6),
+    "track_kernel_update": (*[_I] * 3, *[_D] * 4, *[_P] * 4),
 }
 
 
@@ -59,8 +60,11 @@ def library() -> Any:
 
 def address(array: NDArray[Any]) -> int:
     """Return the address of an array's memory; the array must be kept as long as the address is used."""
-    place: int = array.__array_interface__["data"][0]
-    return place
+    try:
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]  # the fastest way
+    except (TypeError, ValueError, BufferError):  # an array that is read-only, empty or not contiguous
+        place: int = array.__array_interface__["data"][0]
+        return place
 
 
 class Record:

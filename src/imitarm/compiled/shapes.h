@@ -15,7 +15,7 @@ typedef struct {
 typedef struct {
     int64_t n;
     const int8_t *kinds;
-    const double *positions, *quaternions, *sizes, *velocities, *rates, *covariances, *radii;
+    const double *positions, *quaternions, *sizes, *velocities, *rates, *covariances, *radii, *stamps;
     const Hull *const *hulls;
 } Obstacles;
 

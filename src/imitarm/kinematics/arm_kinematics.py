@@ -81,6 +81,7 @@ class ArmMemory:
         sites: positions of the sites in the base frame, shape (nsite, 3) [m].
         force: generalised forces, shape (nv,).
         centers: centres of the spheres that cover the arm, once they have been computed for the posture.
+        posture: the joint positions as bytes.
         n_joints: number of the arm's joints.
         kept: memory that compiled code uses again in every step, by purpose.
     """
@@ -105,7 +106,7 @@ class ArmMemory:
         self.force = np.zeros(model.nv)
         self.centers: Array | None = None
         self.kept: dict[str, Any] = {}
-        self._model, self._positions, self._joints, self._posture = model, positions, joints, b""
+        self._model, self._positions, self._joints, self.posture = model, positions, joints, b""
         self.n_joints = self.data.qpos[positions].size
         stacked = np.zeros((len(landmarks), 3, model.nv))
         self._stacked = stacked.reshape(-1, model.nv)
@@ -121,11 +122,11 @@ class ArmMemory:
     def move_to(self, q: Array) -> None:
         """Compute the kinematics at ``q``, shape (n,), unless the last computation was for this posture."""
         posture = q.tobytes()
-        if posture != self._posture:
+        if posture != self.posture:
             self._qpos[self._positions] = q
             mujoco.mj_kinematics(self._model, self.data)
             mujoco.mj_comPos(self._model, self.data)
-            self._posture, self.centers = posture, None
+            self.posture, self.centers = posture, None
 
     def site_pose(self, site: int) -> Pose:
         """Return the pose of a site in the base frame."""

@@ -35,6 +35,8 @@ class SphereCover:
         slides: True for prismatic joints, shape (n_joints,).
         moves: 1.0 where a joint moves a sphere, else 0.0, shape (m, n_joints).
         dofs: index of each joint's velocity in the model, shape (n_joints,).
+        owners: index of the body that carries each sphere, shape (m,).
+        local: centers of the spheres in the frames of these bodies, shape (m, 3) [m].
         root: body about whose centre of mass MuJoCo gives the twists of the joints.
     """
 
@@ -66,8 +68,9 @@ class SphereCover:
         self.bodies = tuple(model.body(body).name for body in owners)
         self.radii = np.concatenate(radii)
         self.radii.setflags(write=False)
-        self.joints, self._owners = np.array([working.joint(name).id for name in names]), np.array(owners, dtype=int)
-        self._centers = np.concatenate(centers)[:, :, None]
+        self.joints, self.owners = np.array([working.joint(name).id for name in names]), np.array(owners, dtype=int)
+        self.local = np.concatenate(centers)
+        self._centers = self.local[:, :, None]
         self.slides = model.jnt_type[joints] == mujoco.mjtJoint.mjJNT_SLIDE
         self._any_slides = bool(self.slides.any())
         moves = [[_carries(model, int(model.jnt_bodyid[joint]), body) for joint in joints] for body in owners]
@@ -75,7 +78,7 @@ class SphereCover:
         self._moves_of_all = np.concatenate([self._moves[:, 0], np.zeros((len(self.base_radii), len(joints)))])
         # one product gives every local center in every body's rotation; the right ones are picked out of it
         self._columns = np.ascontiguousarray(self._centers[:, :, 0].T)
-        rows = 3 * self._owners[:, None] + np.arange(3)
+        rows = 3 * self.owners[:, None] + np.arange(3)
         self._picked = rows * len(owners) + np.arange(len(owners))[:, None]
         self.moves = self._moves[:, 0]
         self.moves.setflags(write=False)
@@ -93,7 +96,7 @@ class SphereCover:
             data: the kinematics of a posture.
         """
         turned = (data.xmat.reshape(-1, 3) @ self._columns).take(self._picked)
-        turned += data.xpos.take(self._owners, axis=0)
+        turned += data.xpos.take(self.owners, axis=0)
         return np.asarray(turned)
 
     def placed(self, rotations: Array, origins: Array) -> Array:
@@ -103,8 +106,8 @@ class SphereCover:
             rotations: rotation matrices of all bodies of the model, shape (n, n_bodies, 3, 3).
             origins: origins of all bodies in the base frame, shape (n, n_bodies, 3) [m].
         """
-        turned = rotations[:, self._owners] @ self._centers
-        return np.asarray(turned[..., 0] + origins[:, self._owners])
+        turned = rotations[:, self.owners] @ self._centers
+        return np.asarray(turned[..., 0] + origins[:, self.owners])
 
     def speeds(self, data: mujoco.MjData, spheres: NDArray[np.int_], centers: Array, normals: Array) -> Array:
         """Return how fast each joint moves chosen spheres along chosen directions, shape (k, n_joints) [m/rad].

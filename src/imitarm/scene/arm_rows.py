@@ -11,15 +11,17 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from imitarm.compiled import library
 from imitarm.compiled.kernels import Record, address
+from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_kinematics import ArmMemory
 from imitarm.kinematics.ik_problem import Box, Rows
 from imitarm.kinematics.spheres import SphereCover
 from imitarm.scene.convex_hull import Polytope
 from imitarm.scene.distances import PackedObstacles
+from imitarm.scene.scene import Scene
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -45,31 +47,32 @@ def compiled_near_rows(
     limit: Record,
     cover: SphereCover,
     memory: ArmMemory,
-    packed: PackedObstacles,
-    arrays: tuple[Array, Array, Array | None, Array],
-    braking: float,
+    scene: Scene,
+    reach: Array,
+    margins: Array | None,
+    velocity: Array | None,
     box: Box,
 ) -> NearRows | None:
     """Return the rows of ``ClearanceLimit`` by compiled code, which must have been built; None if there is none.
+
+    All arrays must be contiguous.
 
     Args:
         limit: the C structure ``Limit``.
         cover: spheres that cover the arm.
         memory: the kinematics of the posture.
-        packed: n obstacles.
-        arrays: centres of the m spheres (m, 3) [m]; distance of each centre within which obstacles have rows (m,) [m];
-            distance added to the clearance of each obstacle (n,) [m], or None; delay of the commands plus the age of
-            each obstacle (n,) [s]. All are contiguous.
-        braking: time in which the joints can brake to rest [s].
+        scene: obstacles predicted for the current time, with their velocities.
+        reach: distance of each sphere's centre within which obstacles have rows, shape (m,) [m].
+        margins: distance added to the clearance of each obstacle, shape (n,) [m]; None: nothing.
+        velocity: joint velocity, shape (n_joints,) [rad/s]; None: at rest.
         box: bounds of the joint velocity; rows that no velocity within them violates are left out.
     """
-    centers, reach, margins, delays = arrays
+    packed = scene.packed
     record, dt = _record_of(packed)
     room = _room(memory, "near rows", len(packed) * len(reach), (3 * memory.n_joints + 1) * len(reach))
-    places = record.address, dt, _arm_record(cover, memory).address, address(centers), address(reach), limit.address
-    more = None if margins is None else address(margins), address(delays)
-    bounds = address(box.lower), address(box.upper)
-    k = library().obstacle_rows(*places, *more, braking, *bounds, *room.addresses)
+    places = *_arm_of(cover, memory), address(reach), limit.address
+    more = [None if array is None else address(array) for array in (margins, velocity, *box)]
+    k = library().obstacle_rows(record.address, dt, scene.stamp, *places, *more, *room.addresses)
     if not k:
         return None
     obstacle, sphere = room.indices[:k].T.copy()
@@ -147,6 +150,11 @@ class SpherePairs:
         """The C structure of the same name."""
         return Record(len(self.sums), len(self.starts), self.outer, self.inner, self.sums, self.starts)
 
+    @cached_property
+    def _base(self) -> int:
+        """Address of the centres of the base's spheres, which the cover keeps."""
+        return address(self.cover.base_centers)
+
     def distances(self, centers: Array) -> Array:
         """Return the distances of all pairs, shape (k,) [m]; ``centers`` (m, 3) [m] are those of the arm's spheres."""
         every = np.concatenate([centers, self.cover.base_centers])
@@ -157,13 +165,13 @@ class SpherePairs:
         return np.asarray(np.sqrt(squares, out=squares) - self.sums)
 
     def rows(
-        self, memory: ArmMemory, centers: Array, nearness: Nearness, demand: Demand, box: Box | None = None
+        self, arm: ArmModel, q: ArrayLike, nearness: Nearness, demand: Demand, box: Box | None = None
     ) -> OwnRows | None:
         """Return the near pairs; None if there is none.
 
         Args:
-            memory: the kinematics of the posture.
-            centers: centres of the arm's spheres, shape (m, 3) [m].
+            arm: the arm.
+            q: joint positions, shape (n_joints,) [rad].
             nearness: which pairs are near.
             demand: the inequality for each pair.
             box: bounds of the joint velocity; if no velocity within them violates any inequality, the result may be
@@ -171,18 +179,19 @@ class SpherePairs:
         """
         kernel = library()
         if kernel is None:
-            return self._rows_by_numpy(memory, centers, nearness)
+            return self._rows_by_numpy(arm, q, nearness)
+        memory = arm.at(q)
         n_groups, _, _, most = nearness
         room = _room(memory, "own rows", most + n_groups, 2 * (len(self.sums) + len(self.starts)))
-        arm, base = _arm_record(self.cover, memory).address, self.cover.base_centers
         bounds = (None, None) if box is None else (address(box.lower), address(box.upper))
-        places = self._record.address, arm, address(centers), address(base)
+        places = self._record.address, *_arm_of(self.cover, memory), self._base
         k = kernel.self_rows(*places, *nearness, *demand, *bounds, *room.addresses)
         if not k:
             return None
         return OwnRows(room.indices.ravel()[:k].copy(), room.values.ravel()[:k].copy(), room.rows[:k].copy())
 
-    def _rows_by_numpy(self, memory: ArmMemory, centers: Array, nearness: Nearness) -> OwnRows | None:
+    def _rows_by_numpy(self, arm: ArmModel, q: ArrayLike, nearness: Nearness) -> OwnRows | None:
+        centers = arm.sphere_centers(q)
         distances, starts = self.distances(centers), self.starts
         chosen: set[int] = set()
         if len(starts):
@@ -202,7 +211,7 @@ class SpherePairs:
         every = np.concatenate([centers, self.cover.base_centers])
         points = every.take(outer, axis=0)
         normals = (points - every.take(inner, axis=0)) / (distance + self.sums.take(pairs))[:, None]
-        return OwnRows(pairs, distance, self.cover.parting(memory.data, outer, inner, points, normals))
+        return OwnRows(pairs, distance, self.cover.parting(arm.at(q).data, outer, inner, points, normals))
 
 
 class _Room:
@@ -213,7 +222,7 @@ class _Room:
         values: shape (size, 2).
         rows: shape (size, n_joints).
         scratch: shape (n_scratch,).
-        addresses: of these four, beginning with ``scratch``.
+        addresses: the addresses of these four, beginning with ``scratch``.
     """
 
     def __init__(self, size: int, n_joints: int, n_scratch: int) -> None:
@@ -230,16 +239,28 @@ def _room(memory: ArmMemory, purpose: str, size: int, n_scratch: int) -> _Room:
     return room
 
 
-def _arm_record(cover: SphereCover, memory: ArmMemory) -> Record:
-    """Return the C structure ``Arm``; MuJoCo's arrays stay where they are."""
-    record: Record | None = memory.kept.get("arm")
-    if record is None:
-        moves = np.ascontiguousarray(cover.moves)
-        dofs = np.ascontiguousarray(cover.dofs, dtype=np.int64)
-        com = memory.data.subtree_com[cover.root]
-        record = Record(memory.n_joints, len(moves), moves, dofs, memory.data.cdof, com)
-        memory.kept["arm"] = record
-    return record
+class _Arm:
+    """The C structure ``Arm`` of an arm in one thread, and the centres of its spheres."""
+
+    def __init__(self, cover: SphereCover, memory: ArmMemory) -> None:
+        data, m = memory.data, len(cover.radii)
+        dofs, owners = (np.ascontiguousarray(x, dtype=np.int64) for x in (cover.dofs, cover.owners))
+        moves, local = np.ascontiguousarray(cover.moves), np.ascontiguousarray(cover.local)
+        com = data.subtree_com[cover.root]
+        self.record = Record(memory.n_joints, m, moves, dofs, data.cdof, com, owners, local, data.xmat, data.xpos)
+        self.centers, self.posture = np.empty((m, 3)), b""
+        self.places = self.record.address, address(self.centers)
+
+
+def _arm_of(cover: SphereCover, memory: ArmMemory) -> tuple[int, int]:
+    """Return the addresses of the C structure ``Arm`` and of the centres of the spheres in the posture."""
+    arm: _Arm | None = memory.kept.get("arm")
+    if arm is None:
+        arm = memory.kept["arm"] = _Arm(cover, memory)
+    if arm.posture is not memory.posture:
+        library().sphere_centers(*arm.places)
+        arm.posture = memory.posture
+    return arm.places
 
 
 def _record_of(packed: PackedObstacles) -> tuple[Record, float]:
@@ -265,6 +286,7 @@ def _built(packed: PackedObstacles) -> Record:
         packed.angular_velocities,
         packed.covariances,
         packed.radii,
+        packed.stamps,
     )
     kinds = np.ascontiguousarray(packed.kinds, dtype=np.int8)
     hulls = [None if polytope is None else _hull_record(polytope) for polytope in packed.polytopes]

@@ -171,8 +171,7 @@ class SelfClearance:
 
     def _found(self, q: ArrayLike, box: Box | None = None) -> OwnRows | None:
         """Return the nearest pairs."""
-        memory, centers = self.arm.at(q), self.arm.sphere_centers(q)
-        return self.pairs.rows(memory, centers, self._nearness, self._demand, box)
+        return self.pairs.rows(self.arm, q, self._nearness, self._demand, box)
 
 
 class PeriodicSelfClearance:

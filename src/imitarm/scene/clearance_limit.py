@@ -129,20 +129,16 @@ class ClearanceLimit:
         within = self._free if box is None else box
         if library() is None:
             return self._near_by_numpy(q, scene, speed, margins, within)
-        memory, centers, reach = self.arm.at(q), self.arm.sphere_centers(q), self._reach(packed, margins)
-        if packed.still:
-            delays = np.full(len(packed), self.delay)
-        else:
-            delays = np.maximum(scene.stamp - packed.stamps, 0.0) + self.delay
-        braking = 0.0 if speed is None else float((np.abs(speed) / self.arm.max_acceleration).max())
-        arrays = centers, reach, margins, delays
-        return compiled_near_rows(self._record, self._cover, memory, packed, arrays, braking, within)
+        reach = self._reach(packed, margins)
+        return compiled_near_rows(self._record, self._cover, self.arm.at(q), scene, reach, margins, speed, within)
 
     @cached_property
     def _record(self) -> Record:
         """The C structure ``Limit``."""
         limits = self._reduced, self.arm.max_acceleration, self.arm.max_velocity
-        return Record(*limits, self.rate, self.retreat_rate, self.deviations, SHARE, LONGEST_YIELD, _UNMOVED)
+        return Record(
+            *limits, self.delay, self.rate, self.retreat_rate, self.deviations, SHARE, LONGEST_YIELD, _UNMOVED
+        )
 
     def _near_by_numpy(
         self, q: ArrayLike, scene: Scene, velocity: Array | None, margins: Array | None, box: Box
