@@ -278,7 +278,7 @@ def count_failures(outcomes: Sequence[str]) -> str:
         outcomes: for each trial, the kind of failure; an empty text means success.
     """
     counted = Counter(outcome for outcome in outcomes if outcome)
-    return ", ".join(f"{n} {what}" for what, n in counted.most_common()) or "none"
+    return ", ".join(f"{what}: {n}" for what, n in counted.most_common()) or "none"
 
 
 @dataclass(frozen=True, eq=False)

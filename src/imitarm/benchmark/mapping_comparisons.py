@@ -88,7 +88,7 @@ def better_methods_table(results: Results, tasks: Sequence[str]) -> Table:
         "recordings",
         "measure",
         "better method",
-        f"{OURS} minus better method (95 %)>",
+        f"{OURS} minus the better method (95 %)>",
         "relative [%]>",
         "pairs>",
         "p, Holm>",
@@ -172,7 +172,7 @@ def printed_table(results: Results, tasks: Sequence[str]) -> Table:
         f"recordings ({', '.join(tasks)}), and the time is from the closed-loop trials that succeeded. {over} of the 7 "
         "printed means are above the rated torques of the joints, so they can't be mean torques of a Sawyer's joints."
     )
-    return Table("Table 3.1 of the thesis, and ours", columns, tuple(rows), note)
+    return Table("Table 3.1 of the thesis, and our values", columns, tuple(rows), note)
 
 
 def _spread(column: Array) -> str:

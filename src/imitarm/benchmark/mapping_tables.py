@@ -255,7 +255,7 @@ def limits_table(results: Results, tasks: Sequence[str]) -> Table:
         row = (METHODS[name].title, f"{clean} of {len(made)}", *(str(n) for n in counts))
         rows.append((*row, *(f"{ratio:.2f}" for ratio in ratios), str(own)))
     heads = ("method", "recordings without any>", "position>", "velocity>", "acceleration>")
-    columns = (*heads, "worst velocity>", "worst acceleration>", "found by the method>")
+    columns = (*heads, "worst velocity>", "worst acceleration>", "faults found by the method>")
     note = (
         "Position, velocity, acceleration: number of frames that exceed the limit. Worst velocity, worst acceleration: "
         "largest value divided by the limit. Found by the method: number of faults that the method itself found and "

@@ -87,7 +87,7 @@ def success_table(results: MovingResults) -> Table:
         *(f"{name}>" for name in OUTCOMES[2:]),
         "clearance of successes, 5th percentile [mm]>",
         "time per step, median [ms]>",
-        "99th percentile [ms]>",
+        "time per step, 99th percentile [ms]>",
     )
     broken = sum(not limits_kept(dict(r.values)) for r in results.all)
     note = (
@@ -152,8 +152,8 @@ def quality_table(results: MovingResults) -> Table:
         "method",
         "successes>",
         "RMSE [mm]>",
-        "unaffected>",
-        "of the path>",
+        "RMSE, unaffected samples [mm]>",
+        "RMSE of the path [mm]>",
         "duration / learned>",
         "longest stall, 95th percentile [s]>",
         "length / learned>",
@@ -218,9 +218,9 @@ def paired_table(results: MovingResults) -> Table:
         "method",
         "scenes>",
         f"only {ours} succeeds>",
-        "only the other>",
+        "only the other succeeds>",
         "p>",
-        "both>",
+        "both succeed>",
         f"RMSE of {ours} minus the other [mm]>",
         "p>",
     )
@@ -280,8 +280,14 @@ def _claim(
             continue
         p = signed_rank(np.array(both)) if both else 1.0
         difference = float(np.mean(both)) if both else math.nan
-        middle = f"{1e3 * difference:+.1f} mm in {len(both)} scenes (p {_p(p)})" if both else "both succeed in no scene"
-        parts.append(f"{ours} minus {row}: {middle}, only {ours} succeeds in {first}, only {row} in {second}")
+        middle = (
+            f"{1e3 * difference:+.1f} mm in {len(both)} scenes in which both succeed (p {_p(p)})"
+            if both
+            else "both succeed in 0 scenes"
+        )
+        parts.append(
+            f"RMSE of {ours} minus {row}: {middle}, {ours} alone succeeds in {first} scenes, {row} alone in {second}"
+        )
         held.append(p < 0.05 and sign * difference < 0.0)
     if not parts:
         return text, "not run", "–"
@@ -340,7 +346,7 @@ def tracking_table(results: MovingResults) -> Table:
         "velocity error [mm/s]>",
         "NEES (3 is right)>",
         "changes of the track number per run>",
-        "without a track [% of the time]>",
+        "time without a track [%]>",
     )
     note = "At the current time, that is after the prediction over the latency; means over the runs of one method."
     return Table("Tracked obstacles", columns, tuple(rows), note)
@@ -355,7 +361,7 @@ def causes_table(results: MovingResults) -> Table:
         counts = Counter(c["cause"] for c in found)
         away = sum(c["tool_speed"] is not None and c["tool_speed"] <= 0.0 for c in found)
         rows.append((row, str(len(found)), *(str(counts[c]) for c in causes), str(away)))
-    columns = ("method", "contacts>", *(f"{cause}>" for cause in causes), "tool yields or stands>")
+    columns = ("method", "contacts>", *(f"{cause}>" for cause in causes), "of these, the tool yields or stands>")
     return Table("Contacts by cause", columns, tuple(rows) if causes else ())
 
 
@@ -374,7 +380,7 @@ def contacts_table(results: MovingResults) -> Table:
         "obstacle",
         "time [s]>",
         "speed of the obstacle towards the tool [m/s]>",
-        "of the tool [m/s]>",
+        "speed of the tool towards the obstacle [m/s]>",
         "braking",
         "status",
         "cause",

@@ -223,7 +223,7 @@ def tables(frames: Sequence[Frame]) -> list[Table]:
     families = [family for family in FAMILIES if any(frame.family == family for frame in frames)]
     by_family = [
         (
-            f"{family}: {'the object' if first else 'the other'}",
+            f"{family}: {'the object' if first else 'the other object'}",
             [o for o in seen if o.family == family and o.first == first],
         )
         for family in families
@@ -239,7 +239,15 @@ def tables(frames: Sequence[Frame]) -> list[Table]:
         _quality("One object, by distance of the camera", "distance", by_distance),
         Table(
             "False detections and processor time",
-            ("family", "images>", "detections>", "false>", "median ms>", "99 % ms>", "images/s>"),
+            (
+                "family",
+                "images>",
+                "detections>",
+                "false>",
+                "time, median [ms]>",
+                "time, 99th percentile [ms]>",
+                "images/s>",
+            ),
             tuple(_cost(family, own) for family, own in false if own),
             "A detection is false if it is farther than 5 cm from every obstacle. Time: processor time of one thread "
             "for each image; images/s is the inverse of its mean.",
@@ -262,15 +270,15 @@ def _quality(title: str, what: str, groups: Iterable[tuple[str, list[Seen]]], no
         "n>",
         "missed>",
         "merged>",
-        "position, median mm>",
-        "95 %>",
-        "size, median mm>",
-        "uncovered %>",
-        "sticks out, median mm>",
-        "95 %>",
-        "too large, median mm>",
-        "same shape %>",
-        "in 95 % region>",
+        "position error, median [mm]>",
+        "position error, 95th percentile [mm]>",
+        "size error, median [mm]>",
+        "uncovered [%]>",
+        "sticks out, median [mm]>",
+        "sticks out, 95th percentile [mm]>",
+        "too large, median [mm]>",
+        "same shape [%]>",
+        "in the 95 % region>",
     )
     return Table(title, columns, tuple(_row(name, group) for name, group in groups if group), note)
 

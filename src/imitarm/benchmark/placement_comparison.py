@@ -80,17 +80,17 @@ def comparison_tables(results: Iterable[PlacementResult], policy: str = "acfra")
         "planning, 99th percentile [ms]>",
     )
     return [
-        Table("Executed paths beside the mean of the demonstrations", titles, tuple(rows), _STYLE_NOTE),
+        Table("Executed paths compared with the mean of the demonstrations", titles, tuple(rows), _STYLE_NOTE),
         Table(
             f"{policy} in the placements that a baseline solves",
             (
                 f"tilt limit of {policy}",
                 "baseline",
-                "its tilt limit",
+                "tilt limit of the baseline",
                 "skill",
-                "solved by the baseline>",
-                "accepted of these",
-                "solved of these",
+                "placements that the baseline solves>",
+                f"accepted by {policy}",
+                f"solved by {policy}",
                 "ratio of planning times (target: below 1)",
                 f"ratio of RMSE (target: at most {_RMSE_TARGET:g})",
                 f"ratio of deviations (target: at most {_DEVIATION_TARGET:g})",

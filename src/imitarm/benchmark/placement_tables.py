@@ -46,13 +46,19 @@ def _outcomes(results: Sequence[PlacementResult]) -> Table:
                 *(f"{np.median(t):.0f}" if t else "-" for t in times),
             )
         )
-    headings = ("policy", "placements>", "accepted", "arrived, of the accepted", *(f"{name}>" for name in OUTCOMES[2:]))
+    headings = (
+        "policy",
+        "placements>",
+        "accepted",
+        "arrived (of the accepted placements)",
+        *(f"{name}>" for name in OUTCOMES[2:]),
+    )
     return Table(
         "Placements of one to three obstacles on the learned path",
         (
             *headings,
-            f"arrived within {LATE:g} times the learned duration, of the accepted",
-            "smallest clearance when arrived [mm]>",
+            f"arrived within {LATE:g} times the learned duration (of the accepted placements)",
+            "smallest clearance of the motions that arrived [mm]>",
             "time to plan, median [ms]>",
             "time to refuse, median [ms]>",
         ),
@@ -86,11 +92,11 @@ def _beside_the_tool(results: Sequence[PlacementResult]) -> Table:
             medians = (f"{1e3 * np.median(values):.1f}" for values in (ours, theirs))
             rows.append((policy, name, str(len(group)), *medians, f"{ratio:.3f} ({low:.3f} to {high:.3f})"))
     return Table(
-        "Distance from the demonstrations beside that of a plan for the tool alone",
+        "Distance from the demonstrations, compared with a plan for the tool alone",
         (
             "policy",
             "skill",
-            "placements that both solve>",
+            "placements that both plans solve>",
             "RMSE of the whole arm, median [mm]>",
             "RMSE of the tool alone, median [mm]>",
             f"ratio of the medians (target: at most {_RATIO_TARGET:g})",

@@ -37,7 +37,7 @@ _COLUMNS = (
     "highest velocity, acceleration [% of the limit]>",
     "smallest distance between links [mm]>",
     "executed: largest joint error [mrad]>",
-    "executed: torque [% of rated]>",
+    "executed: torque [% of the rated torque]>",
 )
 _STRIDE = 10  # periods over which a hand's speed is measured: in one, most of it would be the camera's noise
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
@@ -101,8 +101,12 @@ def tables(motions: Sequence[Motion]) -> list[Table]:
     first, speed = motions[0], SPEEDS[-1]
     every = [(arm, name, *_row(starts[first.name, arm, speed], name)) for arm in _ARMS for name in RETARGETERS]
     return [
-        Table("modern on every motion", ("motion", "arm", "playback speed>", *_COLUMNS), tuple(modern)),
-        Table(f"All methods on {first.name!r} at playback speed {speed:g}", ("arm", "method", *_COLUMNS), tuple(every)),
+        Table("The method modern with every motion", ("motion", "arm", "playback speed>", *_COLUMNS), tuple(modern)),
+        Table(
+            f"All methods with the motion {first.name!r} at playback speed {speed:g}",
+            ("arm", "method", *_COLUMNS),
+            tuple(every),
+        ),
     ]
 
 

@@ -93,12 +93,12 @@ def _compared(
         return _NOT_RUN
     parts, held = [], []
     for p in found:
-        succeeds = f"only {OURS} succeeds in {p.only_ours}, only {p.row} in {p.only_other}"
+        succeeds = f"{OURS} alone succeeds in {p.only_ours} scenes, the other method alone in {p.only_other}"
         if not p.both:
-            parts.append(f"{p.row}: both succeed in no scene, {succeeds}")
+            parts.append(f"{p.row}: both succeed in 0 scenes, {succeeds}")
             continue
-        text = f"{1e3 * p.difference:+.1f} mm in {p.both} scenes (p {p_value(p.p_rmse)})"
-        parts.append(f"{p.row}: {text}, {succeeds}")
+        text = f"RMSE difference {1e3 * p.difference:+.1f} mm in {p.both} scenes in which both succeed"
+        parts.append(f"{p.row}: {text} (p {p_value(p.p_rmse)}), {succeeds}")
         held.append((p.difference < 0.0) == better and p.p_rmse < _LEVEL)
     return "; ".join(parts), _verdict(held)
 
@@ -135,7 +135,9 @@ def _scaling(results: StaticResults) -> Found:
                 of[n > 3.0] += 1
         if all(of):
             rates[row] = good[0] / of[0] - good[1] / of[1]
-            parts.append(f"{row}: {rate(good[0], of[0])} with at most 2, {rate(good[1], of[1])} with at least 4")
+            parts.append(
+                f"{row}: {rate(good[0], of[0])} with at most 2 obstacles, {rate(good[1], of[1])} with at least 4"
+            )
     ours = rates.pop(_best_row(results, OURS), math.nan)
     return ("; ".join(parts) or "not run"), _verdict([loss > ours for loss in rates.values()])
 
@@ -167,7 +169,9 @@ def _completion(results: StaticResults) -> Found:
         if values:
             parts.append(f"{row}: {np.mean(values):.3f}")
             held.append(float(np.mean(ours)) < float(np.mean(values)) - 1e-3)
-    return f"mean duration of the successes, relative to the learned one: {'; '.join(parts)}", _verdict(held)
+    return f"mean duration of the successful motions, divided by the learned duration: {'; '.join(parts)}", _verdict(
+        held
+    )
 
 
 def _local(results: StaticResults) -> Found:
@@ -176,7 +180,9 @@ def _local(results: StaticResults) -> Found:
     if not known:
         return _NOT_RUN
     unmoved = 100 * float(np.mean([r.value("unmoved") for r in ours]))
-    parts = [f"{OURS}: {1e3 * np.mean(known):.1f} mm where unaffected, {unmoved:.0f} % of the components unmoved"]
+    parts = [
+        f"{OURS}: RMSE of unaffected samples {1e3 * np.mean(known):.1f} mm, {unmoved:.0f} % of the components unmoved"
+    ]
     held = []
     for row in _theirs(results):
         pairs = [
@@ -191,7 +197,8 @@ def _local(results: StaticResults) -> Found:
         both = np.array([p for p in pairs if np.isfinite(p).all()])
         if len(both):
             parts.append(
-                f"{row}: {1e3 * both[:, 0].mean():.1f} against {1e3 * both[:, 1].mean():.1f} mm in {len(both)} scenes"
+                f"{row}: {1e3 * both[:, 1].mean():.1f} mm, {OURS} {1e3 * both[:, 0].mean():.1f} mm in the same "
+                f"{len(both)} scenes"
             )
             held.append(bool(both[:, 0].mean() < both[:, 1].mean()))
     return "; ".join(parts), _verdict(held)
@@ -251,11 +258,11 @@ _CLAIMS: tuple[tuple[str, Callable[[StaticResults], Found]], ...] = (
     ("ACFRA completes the task faster than the others (Fig 4.9)", _completion),
     ("ACFRA needs less memory than the others (Section 4.3)", _cheaper("peak_memory", "kB", 1e-3)),
     ("ACFRA changes the path only where obstacles affect it (Section 4.2)", _local),
-    ("one setting serves obstacles of all shapes", _all_shapes),
-    ("one teacher passes on mistakes, several do not (Section 4.2)", _teachers),
+    ("one setting is enough for obstacles of all shapes", _all_shapes),
+    ("a skill contains the mistakes of one teacher, but not of several (Section 4.2)", _teachers),
     ("cost of ACFRA over the number of obstacles", _cost),
-    ("check: aiming at the obstacle never succeeds", _control("aims-at-obstacle", 0.0)),
-    ("check: without avoidance, at most 2 % succeed", _control("no-avoidance", _TOY)),
+    ("check: a tool that aims at the obstacle never succeeds", _control("aims-at-obstacle", 0.0)),
+    ("check: without avoidance, at most 2 % of the runs succeed", _control("no-avoidance", _TOY)),
     ("check: no method keeps the clearance where the oracle proves it impossible", _beyond_oracle),
 )
 

@@ -276,7 +276,7 @@ def tracking_tables(motions: Sequence[RecordedMotion], sensor: SensorModel = SEN
                 "95th percentile [mm]>",
                 "lag [ms]>",
                 "velocity, RMS [m/s]>",
-                "changes of number>",
+                "changes of the track number>",
             ),
             tuple(accuracy),
             said,
