@@ -26,7 +26,7 @@ def test_no_average_over_failures_without_the_successes_beside_it():
     (row,) = success_table(Results(results)).rows
     assert row[1] == "6 of 8"
     assert row[3].startswith("40")  # the failures' 999 s are not in it
-    assert row[-1] == "2 dropped"
+    assert row[-1] == "dropped: 2"
     assert count_failures(["", "dropped", "tower fell", "dropped", ""]) == "dropped: 2, tower fell: 1"
     assert count_failures(["", ""]) == "none"
     assert written(Interval(0.0412, 0.04, 0.05, 3, 5, 8), Figure("x", "", 1e3)) == "41.2 (40.0 to 50.0), 5 of 8"
