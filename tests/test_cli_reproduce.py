@@ -185,3 +185,39 @@ def test_an_obstacle_follows_the_track_of_the_scene_file(sweep, tmp_path, capsys
     scene.write_text(head + box % "[[5, 0.9, -0.6, 0.1], [4, 0.95, -0.6, 0.1]]")
     assert main(command) == 2
     assert "track: times" in " ".join(capsys.readouterr().err.split())
+
+
+PUSHED = """\
+format: imitarm-scene
+version: 1
+units: m
+obstacles:
+- type: box
+  name: parcel
+  position: [0.95, -0.28, 0.06]
+  size: [0.1, 0.1, 0.12]
+  track:
+  - [1.5, 0.95, -0.28, 0.06]
+  - [3.0, 0.65, -0.28, 0.06]
+  - [5.5, 0.65, -0.28, 0.06]
+  - [7.0, 0.95, -0.28, 0.06]
+"""
+
+
+def test_a_camera_sees_what_the_policy_evades(sweep, tmp_path, capsys):
+    scene = tmp_path / "pushed.yaml"
+    scene.write_text(PUSHED)
+    command = ["reproduce", str(sweep), "--tool", "brush", "--keep-height", "--policy", "rcamo", "--scene", str(scene)]
+    assert main([*command, "--camera", "155", "0", "95"]) == 0
+    assert "no contact in 1 of 1 scenes with obstacles" in capsys.readouterr().out
+    assert main([*command, "--camera", "70", "0", "30"]) == 2
+    assert "--camera: 3" in capsys.readouterr().err
+
+
+def test_a_camera_that_looks_away_from_the_obstacle_does_not_save_the_arm(sweep, tmp_path, monkeypatch, capsys):
+    scene = tmp_path / "pushed.yaml"
+    scene.write_text(PUSHED)
+    monkeypatch.setattr("imitarm.tasks.watching.DepthCamera.frame", lambda self: None)  # it has no images
+    command = ["reproduce", str(sweep), "--tool", "brush", "--keep-height", "--policy", "rcamo", "--scene", str(scene)]
+    assert main([*command, "--tool-only", "--camera", "155", "0", "95"]) == 1
+    assert "parcel" in " ".join(capsys.readouterr().out.split())

@@ -7,8 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from imitarm.kinematics.pose import Pose
+from imitarm.scene import Box, MovingScene, Scene, Sphere
 from imitarm.tasks.pushed_cube import CUBE, CUBE_OBSERVERS, learned_sweep, pushed_cube, run_pushed_cube
 from imitarm.tasks.sweep import MOVING_SCENES, SweepTask
+from imitarm.tasks.watching import WATCHES, delayed
 
 
 @pytest.fixture(scope="module")
@@ -67,3 +70,12 @@ def test_the_packaged_moving_scenes_block_the_learned_path(name):
             if obstacle.distances_at(position[None], False)[0][0] < SweepTask.tool_radius:
                 blocked.add(obstacle.name)
     assert len(blocked) == (2 if "bottle" in name else 1), blocked
+
+
+def test_a_delayed_scene_is_the_scene_one_second_later():
+    still = Sphere(np.array([0.5, 0.0, 0.1]), 0.05, velocity=np.array([0.1, 0.0, 0.0]))
+    tracked = Box(Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])), np.full(3, 0.1), name="box")
+    truth = MovingScene(Scene(None, (still, tracked)), {"box": lambda time: np.array([time**2, 0.0, 0.0])})
+    late = delayed(truth)
+    for time in (0.0, 0.7, 3.0):
+        np.testing.assert_allclose(late.poses(time + WATCHES)[0], truth.poses(time)[0], atol=1e-12)

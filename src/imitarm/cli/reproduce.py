@@ -26,6 +26,7 @@ from imitarm.policies import ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN, POLICIES, Poli
 from imitarm.robots import SimulatedRobot
 from imitarm.scene import MovingScene, Scene, load_moving_scene, standard_fixtures
 from imitarm.skills import Skill
+from imitarm.tasks.watching import delayed, watched
 from imitarm.trajectory import Demonstration
 from imitarm.validation import finite_number
 from imitarm.viewer import Report, write_report
@@ -37,12 +38,15 @@ examples:
   imitarm reproduce left.json --alternative right.json --robot panda --scene bottles.yaml
   imitarm reproduce pour.json --robot panda --scene bottles.yaml --clearance 30 --goal 40 -30 25
   imitarm reproduce pour.json --robot panda --scene moving.yaml --policy rcamo --sensor 5 30 33
+  imitarm reproduce pour.json --robot panda --scene moving.yaml --policy rcamo --camera 150 0 90
 
 The arm is simulated with its inertias and limits.
 The simulator measures the clearance between its own shapes of the arm and of the obstacles.
 The exit status is 1 if no path keeps the required clearance, if the arm touched something, or if it did not finish.
 """
 
+_NEAREST_CAMERA = 0.7  # [m] from the middle of the path
+_AROUND = 0.5  # [m] obstacles are searched so far around the learned path
 FORBIDDEN = {"keep_height": HORIZONTAL_ONLY, "not_down": NOT_DOWN}
 
 
@@ -53,13 +57,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--scene", type=Path, metavar="FILE", help="file of obstacles and goal (YAML); default: no obstacles"
     )
-    parser.add_argument(
+    seen = parser.add_mutually_exclusive_group()
+    seen.add_argument(
         "--sensor",
         nargs=3,
         type=float,
         metavar=("MM", "HZ", "MS"),
         help="observe the obstacles with a sensor and a tracker: standard deviation of the measured positions, frames "
         "per second, latency; default: true positions and velocities without delay",
+    )
+    seen.add_argument(
+        "--camera",
+        nargs=3,
+        type=float,
+        metavar=("X", "Y", "Z"),
+        help="observe the obstacles with a depth camera at this position [cm], a detector and a tracker; the camera "
+        "looks at the middle of the learned path, and watches for one second before the arm moves",
     )
     avoid = parser.add_argument_group("avoidance")
     avoid.add_argument(
@@ -148,8 +161,11 @@ def run(arguments: argparse.Namespace) -> int:
     if scene.goal is not None:  # said before anything moves
         turn = skill.goal_.quaternion if skill.gmr_.has_orientation_ else start.quaternion
         find_posture(arm, Pose(scene.goal.position, turn))
-    motion = tracked.motions or None
-    robot = SimulatedRobot(arm, scene=scene, motion=motion, control=arguments.control, q=find_posture(arm, start))
+    truth = MovingScene(scene, tracked.motions)
+    world = truth if arguments.camera is None else delayed(truth)
+    robot = SimulatedRobot(
+        arm, scene=world.scene, motion=world.motions or None, control=arguments.control, q=find_posture(arm, start)
+    )
     spheres = _tool(skill, arm, arguments.tool_radius)
     policy = _policy(arguments, skill, arm, spheres)
     with progress_bar() as progress:
@@ -162,7 +178,7 @@ def run(arguments: argparse.Namespace) -> int:
             clearance=1e-3 * arguments.clearance,
             link_clearance=None if arguments.tool_only else 1e-3 * arguments.clearance,
             tool_spheres=spheres,
-            observe=_observer(arguments.sensor, MovingScene(scene, tracked.motions)),
+            observe=_observer(arguments, truth, robot, skill),
             progress=lambda share: progress.update(moving, completed=share),
         )
     report = Report(title=f"{skill.task_ or 'A skill'} on {arm.name}", scenes=[result], provenance=provenance())
@@ -178,16 +194,30 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if report.passed else 1
 
 
-def _observer(sensor: Sequence[float] | None, truth: MovingScene) -> Callable[[float], Scene] | None:
+def _observer(
+    arguments: argparse.Namespace, truth: MovingScene, robot: SimulatedRobot, skill: Skill
+) -> Callable[[float], Scene] | None:
     """Return the function by which the policy observes the scene; None: the scene at the start and its velocities."""
-    if sensor is None:
+    scene = truth.scene
+    if arguments.camera is not None:
+        path = skill.gmr_.trajectory(100).positions
+        eye = [0.01 * finite_number(value, "--camera", "cm") for value in arguments.camera]
+        middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
+        if np.linalg.norm(middle - eye) < _NEAREST_CAMERA:
+            raise InputError(
+                f"--camera: {1e2 * np.linalg.norm(middle - eye):.0f} cm from the learned path is too near; the camera "
+                f"measures depths from 50 cm, so keep {1e2 * _NEAREST_CAMERA:.0f} cm"
+            )
+        workspace = (path.min(axis=0) - _AROUND, path.max(axis=0) + _AROUND)
+        surfaces, goal = scene.fixtures, scene.goal
+        return watched(robot, eye, middle, workspace, surfaces=surfaces, goal=goal, fixtures=surfaces)
+    if arguments.sensor is None:
         return truth.at if truth.motions else None
-    noise, rate, latency = sensor
+    noise, rate, latency = arguments.sensor
     try:
         model = SensorModel(noise=1e-3 * noise, rate=rate, latency=1e-3 * latency)
     except InputError as error:
         raise InputError(f"--sensor: {error}") from error
-    scene = truth.scene
     return TrackedScene(truth, model, ObstacleTracker(), goal=scene.goal, fixtures=scene.fixtures)
 
 

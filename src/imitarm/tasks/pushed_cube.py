@@ -15,7 +15,7 @@ from imitarm.control_loop.reproduce import Step, reproduce
 from imitarm.demonstrations import align, read
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.pose import Pose
-from imitarm.perception import ObstacleDetector, ObstacleTracker
+from imitarm.perception import ObstacleTracker
 from imitarm.policies import HORIZONTAL_ONLY
 from imitarm.policies.rcamo import RCAMO
 from imitarm.robots.simulated import SimulatedRobot
@@ -23,7 +23,7 @@ from imitarm.safety import SafetyFilter
 from imitarm.scene import Box, HalfSpace, MovingScene, Scene, Track, standard_fixtures
 from imitarm.skills import Skill
 from imitarm.tasks.sweep import DEMONSTRATIONS, SweepTask, table_top
-from imitarm.tasks.watching import PERIOD, WATCHES, camera_in_front, watch
+from imitarm.tasks.watching import PERIOD, delayed, watched
 from imitarm.trajectory import Rollout
 
 Array = NDArray[np.float64]
@@ -141,7 +141,7 @@ def run_pushed_cube(
     task, skill = SweepTask(seed), learned_sweep()
     arm = SweepTask.arm("panda") if arm is None else arm
     truth = pushed_cube(seed, skill)
-    robot = task.robot(truth, arm=arm)
+    robot = task.robot(delayed(truth) if observer is watched_cube else truth, arm=arm)
     observe = (sensed_cube if observer is None else observer)(truth, robot, seed)
     done = reproduce(
         sweeping_rcamo(skill, task),
@@ -169,17 +169,8 @@ def exact_cube(truth: MovingScene, robot: SimulatedRobot, seed: int) -> Callable
 
 def watched_cube(truth: MovingScene, robot: SimulatedRobot, seed: int) -> CameraObserver:
     """Observe the cube with a depth camera in front of the table, which watches for one second before the arm moves."""
-    detector = ObstacleDetector(robot.arm, surfaces=[table_top(), *standard_fixtures()], workspace=_WORKSPACE)
-    observe = CameraObserver(
-        camera_in_front(robot, _EYE, _MIDDLE, seed=seed).frame,
-        detector,
-        ObstacleTracker(),
-        joints=lambda: robot.state().q,
-        clock=robot.time + WATCHES,
-        fixtures=truth.scene.fixtures,
-    )
-    watch(robot, observe)
-    return observe
+    surfaces, fixtures = [table_top(), *standard_fixtures()], truth.scene.fixtures
+    return watched(robot, _EYE, _MIDDLE, _WORKSPACE, surfaces=surfaces, fixtures=fixtures, seed=seed)
 
 
 CUBE_OBSERVERS: dict[str, Observer] = {"exact": exact_cube, "sensor": sensed_cube, "camera": watched_cube}

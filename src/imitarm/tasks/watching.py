@@ -1,17 +1,19 @@
-"""Cameras that watch a task: a depth camera in front of the table, and one second of watching before the arm moves."""
+"""A depth camera in the control loop, which watches the scene from one second before the arm moves."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from imitarm.control_loop.camera_observer import CameraObserver
 from imitarm.kinematics.pose import Pose, matrix_to_quaternion
-from imitarm.perception import DepthNoise, Intrinsics
+from imitarm.perception import DepthNoise, Intrinsics, ObstacleDetector, ObstacleTracker
 from imitarm.robots.depth_camera import DepthCamera
 from imitarm.robots.simulated import SimulatedRobot
-from imitarm.scene import Scene
+from imitarm.scene import MovingScene, Obstacle, Scene
 
 Array = NDArray[np.float64]
 
@@ -23,7 +25,9 @@ _PIXELS, _FIELD_OF_VIEW = (200, 150), 0.9  # columns and rows, vertical [rad]
 _RANGE = (0.5, 5.0)  # [m] depths that a Kinect v2 measures
 
 
-def camera_in_front(robot: SimulatedRobot, eye: Array, middle: Array, *, seed: int, color: bool = False) -> DepthCamera:
+def camera_in_front(
+    robot: SimulatedRobot, eye: ArrayLike, middle: ArrayLike, *, seed: int, color: bool = False
+) -> DepthCamera:
     """Return a fixed depth camera with the noise of a Kinect v2.
 
     Args:
@@ -45,10 +49,12 @@ def camera_in_front(robot: SimulatedRobot, eye: Array, middle: Array, *, seed: i
     )
 
 
-def looking_at(eye: Array, target: Array) -> Pose:
+def looking_at(eye: ArrayLike, target: ArrayLike) -> Pose:
     """Return the pose of a camera whose z axis points from ``eye`` to ``target`` and whose y axis points down."""
+    eye, target = np.asarray(eye, dtype=float), np.asarray(target, dtype=float)
     z = (target - eye) / np.linalg.norm(target - eye)
-    x = np.cross(z, [0.0, 0.0, 1.0])
+    upright = np.array([0.0, 0.0, 1.0]) if abs(z[2]) < 0.999 else np.array([1.0, 0.0, 0.0])  # not along z
+    x = np.cross(z, upright)
     x /= np.linalg.norm(x)
     return Pose(eye, matrix_to_quaternion(np.column_stack([x, np.cross(z, x), z])))
 
@@ -59,3 +65,48 @@ def watch(robot: SimulatedRobot, observe: Callable[[float], Scene]) -> None:
     while robot.time < start - 0.5 * PERIOD:
         observe(robot.time - start)
         robot.move(np.zeros(robot.arm.n_joints), PERIOD)
+
+
+def delayed(truth: MovingScene) -> MovingScene:
+    """Return the scene one second later: its time is 0 when the arm, after one second of watching, begins to move."""
+    motions = {key: lambda time, motion=motion: motion(time - WATCHES) for key, motion in truth.motions.items()}
+    return MovingScene(replace(truth.scene.at(truth.scene.stamp - WATCHES), stamp=truth.scene.stamp), motions)
+
+
+def watched(
+    robot: SimulatedRobot,
+    eye: ArrayLike,
+    middle: ArrayLike,
+    workspace: ArrayLike,
+    *,
+    surfaces: Sequence[Obstacle],
+    goal: Pose | None = None,
+    fixtures: Sequence[Obstacle] = (),
+    seed: int = 0,
+) -> CameraObserver:
+    """Watch the scene for one second with a depth camera, and return the camera as ``observe`` of a control loop.
+
+    A detector finds the obstacles in the images of the camera, and a tracker follows them. The scene must be
+    :func:`delayed`.
+
+    Args:
+        robot: the simulated robot, at rest.
+        eye: position of the camera in the base frame (3,) [m].
+        middle: point at which the camera looks, in the base frame (3,) [m].
+        workspace: lowest and highest corner of the box in which obstacles are searched, shape (2, 3) [m].
+        surfaces: known surfaces, which are no obstacles. They must not be larger than in the world.
+        goal: goal of the observed scenes.
+        fixtures: fixtures of the observed scenes.
+        seed: seed of the camera's noise.
+    """
+    observe = CameraObserver(
+        camera_in_front(robot, eye, middle, seed=seed).frame,
+        ObstacleDetector(robot.arm, surfaces=surfaces, workspace=workspace),
+        ObstacleTracker(),
+        joints=lambda: robot.state().q,
+        clock=robot.time + WATCHES,
+        goal=goal,
+        fixtures=fixtures,
+    )
+    watch(robot, observe)
+    return observe
