@@ -82,7 +82,7 @@ def test_swapped_sides_are_found_and_mended():
     assert finding.frame == 20 and "in 5 frames" in finding.message
     mended, notes = repaired(SkeletonRecording(wrong))
     assert all(map(same, mended.skeletons, frames)) and notes == [
-        "exchanged left and right again in 5 frames in which the sensor had swapped them"
+        "swapped left and right back in 5 frames in which the sensor had swapped them"
     ]
 
 

@@ -68,7 +68,7 @@ def test_quick_hands_at_an_implausible_rate_are_an_error():
 @pytest.mark.parametrize(("unit", "name"), [(1e-3, "ms"), (1.0, "s")])
 def test_a_kinect_table_in_far_too_long_units_is_refused_with_the_unit(tmp_path, unit, name):
     path = kinect_table(tmp_path / "a.csv", skeletons(40, rate=0.9 if unit == 1.0 else 30.0), unit=unit)
-    expected = "not in units of 100 ns" if name == "s" else f"the times are plausible in {name}: multiply them by 10000"
+    expected = "but this file does not" if name == "s" else f"the times are plausible in {name}: multiply them by 10000"
     with pytest.raises(FileFormatError, match=expected):
         read_recording(path)
 
@@ -186,7 +186,7 @@ def test_frames_that_all_come_twice_are_a_warning_with_the_true_rate():
     frames = [s for s in skeletons(60, rate=15.0) for _ in range(2)]
     frames = [changed(s, time=i / 30.0) for i, s in enumerate(frames)]
     issue = issues(frames)["frozen"]
-    assert issue.severity == "warning" and "15.0 different frames per second" in issue.message
+    assert issue.severity == "warning" and "15.0 new frames per second" in issue.message
 
 
 # --- spikes and jumps

@@ -77,8 +77,8 @@ def test_the_worker_is_told_what_to_read_and_may_not_import_what_lies_around(wor
     ("program", "error", "message"),
     [
         (said("error is not a video that can be read"), InputError, r"film\.mp4: is not a video that can be read$"),
-        ("sys.exit('no module named cv2')", InputError, "does not start.*no module named cv2.*rebuild its environment"),
-        (said("hello world"), InputError, "did not answer as the MediaPipe program of imitarm: 'hello world'"),
+        ("sys.exit('no module named cv2')", InputError, "does not start.*no module named cv2.*rebuild MediaPipe.s"),
+        (said("hello world"), InputError, "did not answer as imitarm.s MediaPipe program does: 'hello world'"),
         (said("imitarm-mediapipe 2 1280 720"), InputError, "did not answer as"),
         (said("imitarm-mediapipe 1 wide high"), InputError, "no image size"),
         (said("imitarm-mediapipe 1 0 720"), InputError, "needs an image size"),
@@ -100,7 +100,7 @@ def test_a_worker_that_fails_is_told_from_one_that_is_done(program, error, messa
 
 
 def test_a_python_that_can_not_be_started_is_told(film, tmp_path):
-    with pytest.raises(InputError, match=r"python: can't be started: No such file.*rebuild its environment"):
+    with pytest.raises(InputError, match=r"python: can't be started: No such file.*rebuild MediaPipe.s environment"):
         MediaPipeSource(film, python=tmp_path / "python")
 
 

@@ -199,7 +199,7 @@ def test_a_foreign_file_is_refused(tmp_path, content, message):
 
 
 def test_times_that_are_no_kinect_ticks_are_refused(tmp_path):
-    with pytest.raises(FileFormatError, match=r"not in units of 100 ns.*multiply"):
+    with pytest.raises(FileFormatError, match=r"units of 100 ns, but this file does not.*multiply"):
         read_recording(kinect_table(tmp_path, tick=1.0 / 30))
 
 

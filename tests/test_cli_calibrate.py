@@ -103,7 +103,7 @@ def test_limbs_that_are_not_known_well_enough_are_not_written(inside, capsys):
         shaken.append(Skeleton(s.time, positions))
     SkeletonRecording(shaken).save("a.csv")
     assert main(["calibrate", "limbs", "a.csv"]) == 1
-    assert "mm, at most 5 mm are accepted" in capsys.readouterr().err
+    assert "mm, but at most 5 mm are accepted" in capsys.readouterr().err
     SkeletonRecording(shaken[:3]).save("b.csv")
     assert main(["calibrate", "limbs", "b.csv"]) == 1
     assert "fully tracked in 3 of 3 frames" in capsys.readouterr().err

@@ -48,7 +48,7 @@ def test_trim_repair_and_one_person(tmp_path, capsys):
     SkeletonRecording(both).save(source)
     assert main(["capture", str(source), "--out", str(out), "--trim", "0.5", "2", "--repair"]) == 0
     shown = capsys.readouterr()
-    assert "kept person 1" in shown.err and "exchanged left and right again in 1 frames" in shown.err
+    assert "kept person 1" in shown.err and "swapped left and right back in 1 frames" in shown.err
     back = read_recording(out)
     assert back.persons == (1,) and back.duration == pytest.approx(1.5, abs=0.05)
     assert main(["capture", str(source), "--out", str(out), "--person", "2", "--force"]) == 0
@@ -200,7 +200,7 @@ def with_spikes(frames):
         (
             microseconds,
             "frame-rate",
-            "units of 100 ns, but are plausible in us (30.0 frames per second): multiply them by 10",
+            "units of 100 ns, but would be plausible in us (30.0 frames per second): multiply them by 10",
         ),
         (z_up, "axes", "use the axes x, z, -y of the file as x, y, z"),
         (frozen, "frozen", "repaired: dropped 89 frames that repeat the previous frame, for up to 2.97 s at a time"),

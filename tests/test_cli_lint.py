@@ -67,7 +67,7 @@ def test_findings_of_one_kind_share_a_row(tmp_path, capsys, n):
     files = [table(tmp_path / f"demo_{i}.csv", rows + [0, i, 0, 0]) for i in range(n)]
     assert main(["lint", *files]) == 2
     text = capsys.readouterr().out
-    assert text.count("probably not the metre") == 1 and f"{n} of this kind; the first: " in text
+    assert text.count("probably not the metre") == 1 and f"{n} findings of this kind; the first: " in text
     assert f"and {n - 1} other" in text and f"{n} errors" in text
     assert main(["lint", *files, "--all"]) == 2
     assert capsys.readouterr().out.count("probably not the metre") == n

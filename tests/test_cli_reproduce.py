@@ -152,14 +152,14 @@ def test_a_certificate_that_needs_a_schedule_is_void_when_the_motion_stops(sweep
     arguments = ["--tool", "brush", "--scene", str(scene), "--report", str(report)]
     assert main(["reproduce", str(sweep), *arguments]) == 1
     text = " ".join(capsys.readouterr().out.split())
-    assert "void" in text and "on schedule, but the motion was not completed" in text, text
-    assert "on schedule, but the motion was not completed" in report.read_text()
+    assert "void" in text and "on schedule, but the motion did not finish" in text, text
+    assert "on schedule, but the motion did not finish" in report.read_text()
 
 
 def test_tilts_concern_the_plan_of_the_whole_arm(sweep, capsys):
     for option in ("--max-tilt", "--goal-tilt"):
         assert main(["reproduce", str(sweep), "--tool", "brush", "--tool-only", option, "10"]) == 2
-        assert f"{option} limits the plan of the whole arm" in " ".join(capsys.readouterr().err.split())
+        assert f"{option} applies only to a plan of the whole arm" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_scene_begins_at_its_stamp(sweep, tmp_path, capsys):

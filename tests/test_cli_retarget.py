@@ -139,7 +139,7 @@ def test_with_fit_a_motion_that_is_too_large_is_made_smaller(shown, tmp_path, ca
     assert run(shown, "--scale", 6, "--fit", "--pace", 0.2, "--orientation", "fixed", "--out", tmp_path / "a.csv") == 0
     printed = capsys.readouterr()
     assert "instead of 6.00, so that the whole motion is within reach" in printed.err
-    assert "slowed to 20 % of its speed" in printed.err
+    assert "slowed the recording to 20 % of its speed" in printed.err
     assert Demonstration.load(tmp_path / "a.csv").trajectory.duration > 20.0
     row = next(line for line in printed.out.splitlines() if "RMS distance of the tool to its own target" in line)
     assert float(row.split("│")[2]) < 40.0
@@ -192,7 +192,7 @@ def test_one_of_two_persons_and_repairs(tmp_path, capsys):
     for words in (
         "repaired: kept person 1",
         "repaired: dropped 1 frames",
-        "exchanged left and right again in 1 frames",
+        "swapped left and right back in 1 frames",
     ):
         assert words in reported
     assert run(source, "--person", 2) == 0

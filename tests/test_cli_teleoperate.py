@@ -115,7 +115,7 @@ def test_nobody_in_the_picture_is_a_failure(capfd):
         (["--seconds", "0"], 2, "--seconds must be above 0"),
         (["--rate", "5"], 2, "--rate must be from 50 to 1000 Hz"),
         (["--rate", "49.9"], 2, "--rate must be from 50 to 1000 Hz"),
-        (["--enable"], 2, "--enable applies to a served robot"),
+        (["--enable"], 2, "--enable applies to a robot of 'imitarm serve'"),
         (["--record", "{}/no/a.csv"], 2, "there is no folder"),
         (["--record", "{}/there.csv"], 2, "already exists; name another file, or replace it with --force"),
         (["--latency", "{}/there.csv"], 2, "already exists"),

@@ -181,7 +181,7 @@ def test_bad_arguments_are_refused(arm):
             CameraObserver(**{**good, **changes})
     observe = CameraObserver(**good)
     observe(1.0)
-    with pytest.raises(InputError, match="before the last call"):
+    with pytest.raises(InputError, match="earlier than in the last call"):
         observe(0.5)
     observe.reset()
     assert observe.stamp is None

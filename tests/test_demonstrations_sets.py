@@ -180,7 +180,7 @@ def test_opposed_rotations_are_an_error(degrees, odd):
     ]
     errors = [f for f in lint(demonstrations) if f.severity == "error"]
     assert [f.code for f in errors] == ["two-rotations"]
-    assert "at the same phase" in errors[0].message
+    assert "at the same fraction of the motion" in errors[0].message
     assert odd is None or errors[0].source.endswith(odd)
 
 

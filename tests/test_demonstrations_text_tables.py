@@ -140,8 +140,18 @@ def test_angles_are_read_beside_velocities_and_efforts():
         ("t x_mm y_cm z_mm a b c d", {}, FileFormatError, "different units of length: cm and mm"),
         ("t x_mm y_mm z a b c d", {}, FileFormatError, "column 'x_mm' has a unit, but column 'z' has none"),
         ("t j0 j1_deg j2 a b c d", {}, FileFormatError, "column 'j1_deg' has a unit, but column 'j0' has none"),
-        ("t x_mm y_mm z_mm a b c d", {"units": "cm"}, InputError, "unit is mm, which contradicts units='cm'"),
-        ("t_ms x y z a b c d", {"time_units": "s"}, InputError, "unit is ms, which contradicts time_units='s'"),
+        (
+            "t x_mm y_mm z_mm a b c d",
+            {"units": "cm"},
+            InputError,
+            "states the unit mm, but this contradicts units='cm'",
+        ),
+        (
+            "t_ms x y z a b c d",
+            {"time_units": "s"},
+            InputError,
+            "states the unit ms, but this contradicts time_units='s'",
+        ),
         ("t j0 j1 J0 b c d e", {}, FileFormatError, "columns 'j0' and 'J0' both hold joint j0"),
         ("t j0 j1 position.j0 b c d e", {}, FileFormatError, "both hold joint j0; remove one"),
         ("t right_j0 right_j1 right_j0 b c d e", {}, FileFormatError, "both hold joint right_j0"),
@@ -435,7 +445,7 @@ def test_other_remarks_are_no_names(tmp_path, first):
 def test_the_order_of_quaternions_that_a_remark_states_is_not_to_be_contradicted(tmp_path):
     file = write(tmp_path / "a.txt", np.column_stack([0.1 * np.arange(30), POSES]), first="# rotations wxyz")
     assert np.allclose(read(file)[0].trajectory.quaternions, POSES[:, 3:])
-    with pytest.raises(InputError, match="the quaternion order wxyz, which contradicts quaternion_order='xyzw'"):
+    with pytest.raises(InputError, match="the quaternion order wxyz, but this contradicts quaternion_order='xyzw'"):
         read(file, quaternion_order="xyzw")
 
 

@@ -142,11 +142,11 @@ def test_the_file_says_units_and_frame(tmp_path):
         ("# format: imitarm-demonstration\n", "", "no line '# format: imitarm-demonstration'"),
         ("version: 1", "version: 2", r"format version '2'; this imitarm reads versions up to 1; update"),
         ("version: 1", "version: one", "format version 'one'"),
-        ("units: m s rad", "units: mm s rad", "units: found 'mm s rad'"),
-        ("frame: tool_to_base", "frame: camera", "frame: found 'camera'"),
-        ("samples: 300", "samples: 301", "announces 301 samples, but the file holds 300; it is incomplete"),
-        ("t,x,y,z", "t,x,z,y", "columns must begin t,x,y,z"),
-        ("t,x,y,z\n", "", "columns must begin t,x,y,z, got no names"),
+        ("units: m s rad", "units: mm s rad", "units is 'mm s rad'"),
+        ("frame: tool_to_base", "frame: camera", "frame is 'camera'"),
+        ("samples: 300", "samples: 301", "announces 301 samples, but the file holds 300; the file is incomplete"),
+        ("t,x,y,z", "t,x,z,y", "first columns must be t,x,y,z"),
+        ("t,x,y,z\n", "", "first columns must be t,x,y,z, got no names"),
     ],
 )
 def test_a_changed_file_is_refused(tmp_path, old, new, message):

@@ -1,4 +1,4 @@
-"""Teach industrial robot arms by showing.
+"""Teach industrial robot arms by demonstration.
 
 The public names are listed in ``__init__.pyi`` and imported when first used, so that ``import imitarm`` stays fast.
 """

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 class Status(Enum):
-    """State of a reproduction, as reported by its policy."""
+    """Status of the reproduction of a skill, as reported by the policy."""
 
     NOMINAL = "nominal"
     """The motion follows the learned path."""
@@ -37,13 +37,13 @@ class Command:
         joint_velocity: velocity of the joints, shape (n_joints,) [rad/s]; if given, it replaces the twist, for example
             along a planned joint path. None: the inverse kinematics computes the joint velocity from the twist.
         posture: joint positions towards which the arm drifts in the null space of the twist, shape (n_joints,) [rad],
-            or None without a preference.
+            None: the arm has no preferred position.
         elbow: SEW (shoulder-elbow-wrist) angle to which the elbow rotates in the null space of the twist [rad]; None:
             no preference.
         progress: completed fraction of the motion, 0 to 1; nan if unknown.
         status: state of the reproduction.
         reason: reason why the motion is not nominal, with the name of the obstacle; empty when nominal.
-        opening: opening to which the gripper's fingers move [m]; None: they stay as they were commanded last.
+        opening: opening to which the gripper's fingers move [m]; None: the last commanded opening stays valid.
     """
 
     twist: Array

@@ -1,7 +1,7 @@
-"""The errors that imitarm raises; they share one base class, so that one ``except`` catches them all.
+"""The errors that imitarm raises; all have one base class, so that one ``except`` clause catches every error.
 
-Every message says what is wrong, where, and what to do about it. Arguments and files are checked when an object is
-constructed or a file is read, not inside a control loop.
+Every message says what is wrong, where the fault is, and what to do about the fault. Arguments and files are checked
+when an object is constructed or a file is read, not inside a control loop.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ class ImitarmError(Exception):
 
 
 class InputError(ImitarmError, ValueError):
-    """A value, shape, unit or option that can't be used; the message names it and the remedy."""
+    """A value, shape, unit or option that can't be used; the message names the faulty item and the remedy."""
 
 
 class FileFormatError(InputError):
-    """A file that is damaged or has an unexpected format; the message names the file and the location in it."""
+    """A file that is damaged or has an unexpected format; the message names the file, and the place in the file."""
 
 
 class UnknownNameError(InputError):

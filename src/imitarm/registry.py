@@ -1,4 +1,4 @@
-"""Registry: the classes of one family, from this package and from other packages (by entry points)."""
+"""Registry: the classes of one family (for example, all policies), from this package and from other packages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Item = TypeVar("Item")
 
 
 class Registry(Mapping[str, Item], Generic[Item]):
-    """The members of one family by name; each is imported when it is first used.
+    """The members of one family, by name; a member is imported when it is first used.
 
     Built-in members are given as ``"module:attribute"``. An installed package adds its members in its
     ``pyproject.toml``, under the family's entry-point group::
@@ -35,10 +35,10 @@ class Registry(Mapping[str, Item], Generic[Item]):
         self._loaded: dict[str, Item] = {}
 
     def __getitem__(self, name: str) -> Item:
-        """Return a member.
+        """Return the member with the name ``name``.
 
         Raises:
-            UnknownNameError: when no member has that name; the message lists all names.
+            UnknownNameError: when no member has this name; the message lists all names.
             InputError: when a package that adds the member can't be imported.
         """
         if not isinstance(name, str):
@@ -54,7 +54,7 @@ class Registry(Mapping[str, Item], Generic[Item]):
         """Add a member for this process, for example from a script.
 
         Raises:
-            InputError: when a built-in member has that name.
+            InputError: when a built-in member has this name.
         """
         if name in self._built_in:
             raise InputError(f"{self.kind} {name!r} is built in; choose another name")

@@ -57,7 +57,7 @@ class Trajectory:
 
     Attributes:
         times: strictly increasing times, shape (n,) [s].
-        positions: shape (n, 3) [m].
+        positions: positions of the tool, shape (n, 3) [m].
         quaternions: unit quaternions w, x, y, z with continuous signs, shape (n, 4); None when the rotation is not
             known.
 
@@ -121,7 +121,7 @@ class Trajectory:
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
     def at(self, times: ArrayLike) -> tuple[Array, Array | None]:
-        """Interpolate positions linearly and rotations along the shortest arc; hold the ends outside the time span.
+        """Interpolate positions linearly and rotations along the shortest arc; both are constant outside the times.
 
         Args:
             times: query times [s], shape (m,), or one number.
@@ -147,7 +147,7 @@ class Trajectory:
         return Pose(self.positions[index], q)
 
     def resample(self, n: int) -> Trajectory:
-        """Return ``n`` samples equally spaced in time, including the first and the last one.
+        """Return ``n`` samples that are equally spaced in time, including the first and the last sample.
 
         Raises:
             InputError: when ``n`` is not a whole number from 2 to 10 million.
@@ -157,7 +157,7 @@ class Trajectory:
         return Trajectory(times, *self.at(times))
 
     def with_positions(self, positions: ArrayLike) -> Trajectory:
-        """Return a motion with the same times and rotations and other positions, shape (n, 3) [m].
+        """Return a motion with the same times and rotations, but with the positions ``positions``, shape (n, 3) [m].
 
         Raises:
             InputError: when ``positions`` has another shape, or a number is not finite.
@@ -180,7 +180,7 @@ class Demonstration:
         trajectory: timed poses of the tool in the base frame.
         joints: joint angles (n, n_joints) [rad] of the arm that was guided; None when they were not recorded.
         task: name of the demonstrated task, for example ``"sweep"``.
-        source: origin of the motion, for example a file name, a range of rows or the name of a recorder.
+        source: origin of the motion, for example a file name, a range of rows in a file, or the name of a recorder.
         joint_names: one name for each column of ``joints``; ``joint_1``, ``joint_2``, ... when not given.
 
     Raises:
@@ -224,7 +224,7 @@ class Demonstration:
         return html_table("Demonstration", {**rows, "joints": ", ".join(self.joint_names) or "not recorded"})
 
     def with_trajectory(self, trajectory: Trajectory, joints: Array | None) -> Demonstration:
-        """Return a copy with another motion and the same task, source and joint names."""
+        """Return a copy with the motion ``trajectory`` and ``joints``, and the same task, source and joint names."""
         return replace(self, trajectory=trajectory, joints=joints)
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -307,18 +307,18 @@ def read_demonstration_table(path: str | os.PathLike[str]) -> Table:
     for key, wanted in (("units", _UNITS), ("frame", _FRAME)):
         if table.remarks.get(key, wanted) != wanted:
             raise FileFormatError(
-                f"{path}: {key}: found {table.remarks[key]!r}, but {wanted!r} is needed; convert the numbers"
+                f"{path}: {key} is {table.remarks[key]!r}, but must be {wanted!r}; convert the numbers"
             )
     samples = table.remarks.get("samples", str(len(table.values)))
     if samples != str(len(table.values)) or not table.ends_in_newline:
         raise FileFormatError(
             f"{path}: the header announces {samples} samples, but the file holds {len(table.values)}; "
-            "it is incomplete, copy it again"
+            "the file is incomplete: copy it again"
         )
     names = table.names or ()
     pose = _POSE_COLUMNS + (_QUATERNION_COLUMNS if "qw" in names else ())
     if names[: len(pose)] != pose:
-        raise FileFormatError(f"{path}: columns must begin {','.join(pose)}, got {','.join(names) or 'no names'}")
+        raise FileFormatError(f"{path}: first columns must be {','.join(pose)}, got {','.join(names) or 'no names'}")
     return table
 
 
@@ -331,10 +331,10 @@ class Rollout:
         joints: measured joint angles (n, n_joints) [rad].
         velocities: measured joint velocities (n, n_joints) [rad/s].
         torques: torques of the joints' drives (n, n_joints) [N m].
-        clearance: smallest distance between the arm (with its tool) and any obstacle (n,) [m]; negative when they
-            overlap, inf when there was no obstacle.
+        clearance: smallest distance between the arm (with its tool) and any obstacle (n,) [m]; negative when arm and
+            obstacle overlap, inf without obstacles.
         success: whether the motion was finished in time.
-        reason: reason why the motion ended.
+        reason: explanation of why the motion ended.
         details: further measurements of the robot or the task, by name.
 
     Raises:

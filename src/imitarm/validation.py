@@ -1,7 +1,7 @@
 """Checks of arguments, shared by all public functions: numbers, vectors, arrays, counts, flags and types.
 
 Each function returns the value in a form that is safe to compute with, or raises :class:`InputError`. The message names
-the argument, its unit, the expected and the given value. NaN, infinities, text, booleans, complex numbers,
+the argument, its unit, the expected value and the given value. NaN, infinities, text, booleans, complex numbers,
 ``None`` and masked entries are not accepted as numbers. Arrays of float64 are returned without a copy.
 
 :func:`finite_vector` takes less than a microsecond for an array of float64, so that it may be used in a control loop.

@@ -1,4 +1,4 @@
-"""SkeletonCamera: a simulated skeleton camera with noise, bias, jitter, dropouts and occlusion; seeded."""
+"""SkeletonCamera: a simulated skeleton camera with noise, bias, jitter, dropouts and occlusion, all from one seed."""
 
 from __future__ import annotations
 
@@ -79,39 +79,43 @@ _SHAPE = (len(JOINTS), 3)
 class SkeletonCamera:
     r"""A simulated skeleton camera with the errors of a real camera.
 
-    The page docs/capture.md describes how the errors of real cameras were measured.
+    The page docs/capture.md describes how the errors of real cameras were measured. For each joint, a camera reports a
+    state: it *tracks* the joint, *infers* the position from other joints, or has *lost* the joint.
 
     A joint at position x is measured at :math:`x + b + M c + n`. The slow error ``c`` has standard deviation ``sigma``
     on each axis across the line of sight, and ``1.4 sigma`` along the line of sight. For finger tips and thumbs, the
-    standard deviations of the slow error are 1.5 times as large. The slow error is a Matern process of order 3/2 over a
-    variable u that combines the time t and the path length :math:`|dx|` of the joint,
+    standard deviations of the slow error are 1.5 times as large. The slow error is a random process with a Matern
+    covariance of order 3/2. The variable u of this process increases with the time t and with the length :math:`|dx|`
+    of the joint's path,
 
     .. math:: du = dt / 5\,\mathrm{s} + |dx| / 8\,\mathrm{cm}, \qquad
               \mathrm{E}\,[c(0)\,c(u)] = \sigma^2 (1 + u)\,e^{-u},
 
-    The slow error depends on the path length because, in recordings of a Kinect v2, the length of a bone hardly changes
-    while the arm is at rest, but changes by 1 to 2 cm while a joint moves by 10 to 20 cm. The matrix ``M`` correlates
-    the errors of neighbouring joints, so that the length of the forearm varies less than the length of the upper arm.
-    The white noise ``n`` grows with the joint's speed. With ``sigma`` of 12 mm, the standard deviation of ``n`` for
-    elbow and wrist is 0.2 mm at rest plus 5 mm per m/s. The bias ``b`` is a constant error of the elbow's depth.
+    Recordings of a Kinect v2 are the reason why the slow error depends on the path. In these recordings, the measured
+    length of a bone hardly changes while the arm is at rest, but changes by 1 to 2 cm while a joint moves by 10 to 20
+    cm. The matrix ``M`` correlates the errors of neighbouring joints, so that the length of the forearm varies less
+    than the length of the upper arm. The white noise ``n`` grows with the joint's speed. For elbow and wrist and a
+    ``sigma`` of 12 mm, the standard deviation of ``n`` is 0.2 mm at rest, and increases by 5 mm for each m/s of speed.
+    The bias ``b`` is a constant error of the elbow's depth.
 
-    * Timing: frames arrive at ``rate`` with ``jitter``. 3 % of the intervals between frames are twice the usual length,
-      and 1 % of the frames show nobody.
+    * Timing: on average, ``rate`` frames arrive per second, and the time between frames varies by ``jitter``. 3 % of
+      the intervals between frames are twice the usual length, and 1 % of the frames show nobody.
     * Dropouts: for each arm, a dropout begins ``dropout`` times per second on average and lasts 2 to 20 frames. During
-      a dropout, the arm is inferred (with three times the error), the arm is lost, or the whole person is lost.
-    * Occlusion: when a forearm is behind the torso, its joints are inferred; when an elbow is behind the hand of the
-      same arm, the elbow is inferred.
+      a dropout, one of three things happens: the arm is inferred, with three times its usual error; the arm is lost; or
+      the whole person is lost.
+    * Occlusion: the joints of a forearm are inferred while the forearm is behind the torso. An elbow is inferred while
+      it is behind the hand of the same arm.
     * Hand states: occasionally, the state of a hand is wrong for one or two frames.
 
     Args:
-        seed: seed of all random values.
+        seed: number that determines all random values of the camera.
         sigma: standard deviation of the slow error [m].
         rate: frames per second [Hz].
         jitter: standard deviation of the time between frames [s].
         dropout: mean number of dropouts of each arm per second [Hz].
         occlusion: whether joints that are hidden behind the body are inferred; otherwise, they are tracked.
-        elbow_bias: largest magnitude of the elbow's depth bias [m]; the actual bias is drawn from a uniform
-            distribution.
+        elbow_bias: largest magnitude of the elbow's depth bias [m]; the actual bias is drawn uniformly between minus
+            and plus this value.
         faultless: whether to omit dropouts, occlusions, jitter and wrong hand states; with ``sigma=0`` and
             ``elbow_bias=0``, the camera reports the truth.
 
@@ -152,7 +156,7 @@ class SkeletonCamera:
 
     @classmethod
     def from_seed(cls, seed: int, *, rate: float = 30.0) -> SkeletonCamera:
-        """Return a camera with a random sigma between 1 and 2 cm and default values for everything else."""
+        """Return a camera with a random ``sigma`` between 1 and 2 cm, and with default values for the other errors."""
         return cls(seed, sigma=float(np.random.default_rng([30314, seed]).uniform(0.01, 0.02)), rate=rate)
 
     @classmethod
@@ -170,7 +174,7 @@ class SkeletonCamera:
         return time + period + self.jitter * float(np.clip(self._rng.normal(), -2.7, 2.7))
 
     def see(self, truth: Skeleton) -> Skeleton | None:
-        """Return the skeleton that the camera reports, or None if it reports no skeleton.
+        """Return the skeleton that the camera reports, or None if the frame shows nobody.
 
         Args:
             truth: the true skeleton, with a later time than the skeleton of the previous call.

@@ -1,4 +1,4 @@
-"""Find faults in a recording of a person (``check``), and fix the faults that need no guessing (``repaired``)."""
+"""Find faults in a recording of a person (``check``), and fix those that can be fixed for certain (``repaired``)."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def repaired(recording: SkeletonRecording) -> tuple[SkeletonRecording, list[str]
     memory = SideMemory()
     right = [memory.update(skeleton) for skeleton in kept]
     if memory.swaps:
-        notes.append(f"exchanged left and right again in {memory.swaps} frames in which the sensor had swapped them")
+        notes.append(f"swapped left and right back in {memory.swaps} frames in which the sensor had swapped them")
     return recording.with_skeletons(_without_spikes(right, notes)), notes
 
 
@@ -192,7 +192,7 @@ class _View:
             )
         name, factor = fit
         return (
-            f"the times were read in units of {time_unit_name(self.time_unit)}, but are plausible in {name} "
+            f"the times were read in units of {time_unit_name(self.time_unit)}, but would be plausible in {name} "
             f"({1.0 / (factor * self.period):.1f} frames per second): multiply them by {factor:.10g}"
         )
 
@@ -262,7 +262,7 @@ def _rate(view: _View) -> Iterator[RecordingIssue]:
 def _hand_speed(view: _View) -> Iterator[RecordingIssue]:
     speed = view.hand_speed
     if speed > FASTEST_HAND:
-        message = f"the hands move at {speed:.0f} m/s (90th percentile over three frames), faster than a person can"
+        message = f"the hands move at {speed:.0f} m/s (90th percentile), faster than a person can move them"
         yield view.issue("error", "hand-speed", message, view.unit_remedy())
 
 
@@ -312,7 +312,7 @@ def _frozen(view: _View) -> Iterator[RecordingIssue]:
     if fraction > _REPEATED and view.period > 0.0:
         rate = (1.0 - fraction) / view.period
         message = (
-            f"{100 * fraction:.0f} % of the frames repeat the previous frame: {rate:.1f} different frames per second"
+            f"{100 * fraction:.0f} % of the frames repeat the previous frame: only {rate:.1f} new frames per second"
         )
         yield view.issue(
             "warning", "frozen", message, "repair the recording to drop these frames", int(np.argmax(whole)) + 1

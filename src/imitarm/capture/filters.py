@@ -24,9 +24,10 @@ class PersonFilter(SkeletonSource):
 
     The filter follows the first person who appears, and ignores everybody else. The filter follows another person only
     after the first person has been out of view for more than ``patience`` on the source's clock. By that time, every
-    retargeter has already stopped; it starts again with the new person. A camera that tracks only one person at a time
-    may give two successive persons the same number. The filter therefore also ignores a person who appears at a
-    position that the followed person cannot have reached by walking.
+    retargeter (the part that turns a person's motion into a robot's motion) has stopped the robot. The retargeter
+    starts again with the new person. A camera that tracks only one person at a time may give two successive persons the
+    same number. The filter therefore also ignores a person who appears at a position that the followed person cannot
+    have reached by walking.
 
     Args:
         source: the source to filter.
@@ -158,18 +159,19 @@ def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
 
     .. math:: g_j = |l_j - l'_j| + |r_j - r'_j| - |l_j - r'_j| - |r_j - l'_j|
 
-    The joints are swapped back if this length exceeds the threshold :math:`m(v) = \max(0.15, v t)` [m], where v is the
-    largest plausible speed of a joint. Three conditions are tested in this order:
+    The joints are swapped back if :math:`g_j` exceeds the threshold :math:`m(v) = \max(0.15, v t)` [m], where v is the
+    largest plausible speed of a joint: 0.5 m/s for shoulders and hips, and 4 m/s for the joints of an arm. Three
+    conditions are tested in this order:
 
     1. The whole body is swapped back if :math:`\sum_j g_j > \sum_j m(0.5)` over the pairs of shoulders and hips.
     2. Elbows, wrists and hands are swapped back if :math:`g_j > m(4)` for the elbows and also for the wrists.
     3. Otherwise, wrists and hands alone are swapped back if :math:`g_j > m(4)` for the wrists.
 
-    Conditions 2 and 3 follow the swap of the whole body, if there was one. A joint is used if it is visible, and both
-    joints of its pair were visible in the previous frame. If only one joint of a pair is used, :math:`g_j` contains
-    only the terms of this joint, and the threshold of the pair is halved. Without a usable joint of a pair, condition 1
-    omits the pair, and conditions 2 and 3 do not hold. Hands that touch are too close to each other to satisfy a
-    condition, so they are not swapped.
+    If condition 1 holds, the whole body is swapped back before conditions 2 and 3 are tested. A joint is used only if
+    it is visible now and both joints of its pair were visible in the previous frame. If only one joint of a pair is
+    used, :math:`g_j` contains only the terms of this joint, and the threshold of the pair is halved. If neither joint
+    of a pair can be used, condition 1 leaves the pair out, and a condition 2 or 3 that needs the pair does not hold.
+    Hands that touch are too close to each other to satisfy a condition, so they are not swapped.
 
     Args:
         skeleton: skeleton as the camera reports it.
@@ -240,7 +242,7 @@ class SideMemory:
         self._seen = np.full(len(JOINTS), -np.inf)
 
     def update(self, skeleton: Skeleton) -> Skeleton:
-        """Return the next skeleton, with left and right assigned correctly."""
+        """Return ``skeleton`` with left and right assigned as in the skeleton of the previous call."""
         right = skeleton
         period = abs(skeleton.time - self._time)
         if period <= MEMORY:
@@ -291,9 +293,10 @@ class SideFilter(SkeletonSource):
 
 
 class RealtimeSource(SkeletonSource):
-    """Delays a source so that it runs in real time.
+    """Delays the skeletons of a source so that they arrive in real time.
 
-    Each skeleton is returned no earlier than its time stamp, counted from the first skeleton.
+    Time 0 is the first reading. Each skeleton is returned no earlier than its time stamp relative to the first
+    skeleton.
 
     Args:
         source: source that returns skeletons as fast as they are read.

@@ -60,7 +60,8 @@ def native_header(source: str, frames: str) -> str:
 
     Args:
         source: origin of the skeletons.
-        frames: number of frames, or :data:`UNFINISHED`; padded, so that it can be overwritten in place.
+        frames: number of frames, or :data:`UNFINISHED`; padded with spaces, so that a number can later overwrite the
+            text.
     """
     remarks = {
         "format": FORMAT,
@@ -160,8 +161,8 @@ def _persons(table: Table, content: bytes) -> list[int]:
 def read_kinect_table(path: str, content: bytes) -> tuple[list[Skeleton], list[RecordingIssue]]:
     """Read a Kinect SDK table of 101 columns: time [100 ns], then x, y, z [m] and state of 25 joints in SDK order.
 
-    Times are counted from the first frame. A table of this kind contains neither person numbers nor hand states. A
-    comma at the end of a line is accepted.
+    The returned times are counted from the first frame. A table of this kind contains neither person numbers nor hand
+    states. A comma at the end of a line is accepted.
 
     Args:
         path: path of the file, for messages.
@@ -189,8 +190,8 @@ def read_kinect_table(path: str, content: bytes) -> tuple[list[Skeleton], list[R
         fit = time_unit_that_fits(1.0 / period, TICK) if period > 0.0 else None
         unit = "" if fit is None else f"the times are plausible in {fit[0]}: multiply them by {fit[1]:.10g}; "
         raise FileFormatError(
-            f"{path}: {n} frames within {abs(float(times[-1])):.3g} s; the times are not in units of 100 ns, in "
-            f"which the Kinect SDK writes them; {unit}if the times are in seconds, multiply them by 10 000 000"
+            f"{path}: {n} frames within {abs(float(times[-1])):.3g} s; the Kinect SDK writes times in units of 100 ns, "
+            f"but this file does not; {unit}if the times are in seconds, multiply them by 10 000 000"
         )
     return skeletons, issues
 
@@ -241,8 +242,8 @@ def _far_joints(table: Table, times: Array, joints: Array) -> list[RecordingIssu
     frame = int(np.argmax(far.any(axis=1)))
     message = (
         f"{int(far.sum())} joint positions in {int(far.any(axis=1).sum())} frames are not finite or more than "
-        f"{FARTHEST:.0f} m away; the first is {JOINTS[int(np.argmax(far[frame]))]} in line {int(table.lines[frame])}; "
-        "these joints count as lost"
+        f"{FARTHEST:.0f} m from the sensor; the first is {JOINTS[int(np.argmax(far[frame]))]} in line "
+        f"{int(table.lines[frame])}; these joints count as lost"
     )
     remedy = "check the unit of length and the sensor"
     if far.mean() > 0.5:
@@ -296,7 +297,7 @@ class MotionCapture:
     Attributes:
         times: time stamps, shape (n,) [s].
         points: shoulder, elbow, wrist, hand tip, thumb, shape (n, 5, 3) [m].
-        source: the file.
+        source: path of the file.
     """
 
     times: Array
@@ -311,14 +312,14 @@ class MotionCapture:
         its end next to the forearm.
 
         Args:
-            path: the file.
-            to_body: rotation from the file's axes to the person's axes (x forward, y left, z up), shape (3, 3); None:
-                the file already uses the person's axes.
+            path: path of the file.
+            to_body: rotation matrix from the file's axes to the person's axes (x forward, y left, z up), shape (3, 3);
+                None: the file already uses the person's axes.
 
         Raises:
             FileFormatError: when the file is not a motion capture of a right arm; the message names the fault and the
                 line.
-            InputError: when ``to_body`` is not a rotation.
+            InputError: when ``to_body`` is not a rotation matrix.
         """
         rotation = np.eye(3) if to_body is None else np.array(to_body, dtype=float)
         orthonormal = rotation.shape == (3, 3) and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)

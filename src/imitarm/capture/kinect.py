@@ -30,7 +30,7 @@ class BodyCamera(SkeletonSource):
     """A camera whose driver delivers, in each frame, all bodies in view.
 
     Attributes:
-        name: name for messages.
+        name: name of the camera in messages.
     """
 
     live = True
@@ -53,7 +53,7 @@ class BodyCamera(SkeletonSource):
 
     @property
     def over(self) -> bool:
-        """Whether the source is closed, or the camera is gone."""
+        """Whether the source is closed, or the camera was unplugged."""
         return self._over
 
     def close(self) -> None:

@@ -99,15 +99,16 @@ class LandmarkConverter:
 
     **Position.** MediaPipe's positions in metres are relative to the hips. Without a correction, a hand at rest would
     therefore seem to move whenever the hips move. The translation t of the hips is chosen so that the landmarks
-    :math:`X_j, Y_j, Z_j` agree with the image. Let :math:`u, v` be image coordinates relative to the image's middle, in
-    units of the focal length, and :math:`k` the visibility. The translation t solves
+    :math:`X_j, Y_j, Z_j` [m] agree with the image. Let :math:`u_j, v_j` be the coordinates of landmark j relative to
+    the image's middle, in units of the focal length. Let :math:`k_j` be the visibility of the landmark, from 0 to 1.
+    The translation t solves
 
     .. math:: \min_t \sum_j k_j^2 \left( (X_j + t_x - u_j (Z_j + t_z))^2 + (Y_j + t_y - v_j (Z_j + t_z))^2 \right)
 
-    Finding t is a linear least-squares problem. Across the line of sight, t is accurate to centimetres. Along the line
-    of sight, t is noisy, and its accuracy depends on MediaPipe's scale and on the field of view. The distance along the
-    line of sight is therefore averaged over 0.1 s, and the other two components of t are then fitted again. All joints
-    move by the same t, so positions relative to other joints do not change.
+    This problem is linear in t. Across the line of sight, t is accurate to centimetres. Along the line of sight, t is
+    noisy, and its accuracy depends on MediaPipe's scale and on the field of view. The distance along the line of sight
+    is therefore averaged over 0.1 s, and the other two components of t are then fitted again. All joints move by the
+    same t, so positions relative to other joints do not change.
 
     **Perspective.** MediaPipe's positions in metres assume a camera that looks straight at the person. The positions
     are therefore rotated by the angle between the camera's axis and the line of sight to the hips.
@@ -205,7 +206,7 @@ _SILENT = 20.0  # [s] without a line: the process hangs
 _TICK = 0.01  # [s] added to a wait, so that the time is certainly over
 _KEPT = 64  # images of a video that are processed ahead
 _NUMBERS = 6 * N_LANDMARKS
-_ANEW = "rebuild its environment: python -m imitarm.capture.mediapipe_environment"
+_ANEW = "rebuild MediaPipe's environment: python -m imitarm.capture.mediapipe_environment"
 _CHATTER = r"[IW]\d{4} |INFO: |WARNING: All log messages"  # what MediaPipe logs when all is well
 
 
@@ -336,7 +337,7 @@ class MediaPipeSource(SkeletonSource):
         if words[0] == b"error":
             raise InputError(f"{self._shown_name}: {_text(words[1:])}")
         if words[:2] != [b"imitarm-mediapipe", str(PROTOCOL).encode()] or len(words) != 4:
-            raise InputError(f"{python} did not answer as the MediaPipe program of imitarm: {_text(words)[:80]!r}")
+            raise InputError(f"{python} did not answer as imitarm's MediaPipe program does: {_text(words)[:80]!r}")
         if not (words[2].isdigit() and words[3].isdigit()):
             raise InputError(f"{python} sends no image size: {_text(words)[:80]!r}")
         return int(words[2]), int(words[3])

@@ -5,7 +5,7 @@ This module finds the environment, creates it, and runs MediaPipe in it as a pro
 MediaPipe 0.10.21, the last version that includes its models, needs numpy below 2, but imitarm needs numpy 2. MediaPipe
 is therefore installed in an environment of its own, without imitarm::
 
-    python -m imitarm.capture.mediapipe_environment            # creates it where imitarm looks for it
+    python -m imitarm.capture.mediapipe_environment # creates this environment
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from typing import IO
 from imitarm.errors import ImitarmError, InputError, TaskFailedError
 
 VARIABLE = "IMITARM_MEDIAPIPE_PYTHON"
-"""Environment variable with the path of a Python that has MediaPipe; if it is set, :func:`folders` is not searched."""
+"""Environment variable: path of a Python interpreter that has MediaPipe; if set, :func:`folders` is not searched."""
 
 VERSION = "0.10.21"
 VERSIONS = ((3, 9), (3, 12))  # versions of Python for which it exists
@@ -77,9 +77,10 @@ def find_python() -> Path:
 
 
 def folders() -> list[Path]:
-    """Return the possible folders of the environment: in a checkout of the repository, then in the user's data.
+    """Return the folders in which the environment may be, in the order in which they are searched.
 
-    A new environment is created in the first folder.
+    The first folder lies in the checkout of the repository, if imitarm runs from one; the other folder lies in the
+    user's data folder. A new environment is created in the first folder of the list.
     """
     checkout = Path(__file__).resolve().parents[3]
     beside = [checkout / ".venv-mediapipe"] if (checkout / "pyproject.toml").is_file() else []
@@ -148,7 +149,7 @@ def _run(what: str, command: list[str]) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Create the environment in the given folder, or by default where imitarm looks for it; return the exit status."""
+    """Create the environment in the given folder (default: the first of :func:`folders`); return the exit status."""
     folder = Path(arguments[0]) if arguments else folders()[0]
     try:
         sys.stdout.write(f"made {make(folder)}\n")
@@ -204,7 +205,7 @@ class LineProcess:
 
     @property
     def pid(self) -> int:
-        """Process number."""
+        """Identifier that the operating system gave to the process."""
         return self._process.pid
 
     def line(self, timeout: float) -> bytes | None:

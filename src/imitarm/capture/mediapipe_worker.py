@@ -5,7 +5,8 @@ must not import imitarm. The class ``MediaPipeSource`` of imitarm starts the pro
 
 Each line of the output has one of these forms:
 
-* ``imitarm-mediapipe 1 WIDTH HEIGHT`` is the first line, which is sent with the first image.
+* ``imitarm-mediapipe 1 WIDTH HEIGHT`` is the first line, which is sent with the first image: the version of this
+  protocol, and the size of the images in pixels.
 * ``frame TIME NUMBERS`` is an image with a person. For each of 33 landmarks, NUMBERS contains the world position x y z
   [m], the image position x y (0 to 1) and the visibility.
 * ``nobody TIME`` is an image without a person.
@@ -144,7 +145,7 @@ def _webcam(cv2: Any, number: int) -> Iterator[tuple[float, Any]]:
     while True:
         with came:
             if not came.wait_for(lambda: latest[0] is not None, _SILENT):
-                raise StopError(f"camera {number} gives no images any more; is it still plugged in?")
+                raise StopError(f"camera {number} no longer delivers images; is it still plugged in?")
             image, when = latest
             latest[0] = None
         yield when, image

@@ -1,4 +1,4 @@
-"""Motions of a synthetic person's hand: random reaches, and shapes that the hand draws repeatedly; seeded."""
+"""Motions of a synthetic person's hand, all determined by a seed: random reaches, and shapes drawn repeatedly."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _SPEED = (0.25, 0.55)  # [m/s] mean speed of a reach
 
 
 def minimum_jerk(points: ArrayLike, times: ArrayLike) -> BSpline:
-    """Return the quintic spline through ``points`` (n, d) at ``times`` (n,) that is at rest at both ends.
+    """Return the quintic spline that passes through ``points`` (n, d) at ``times`` (n,) and is at rest at both ends.
 
     The quintic spline is the minimum-jerk path through the points (Flash and Hogan 1985).
     """
@@ -41,7 +41,7 @@ def reaching(person: Person, seed: int, *, duration: float = 12.0, kind: str = "
     """Return the motion of a person who reaches from point to point with the right hand.
 
     Args:
-        person: who moves.
+        person: the person who moves.
         seed: seed of the random points and speeds.
         duration: duration of the motion [s]; the hand is at rest during the first second.
         kind: ``"inside"``: all reaches end well within the workspace. ``"edge"``: every second reach stretches the arm
@@ -116,11 +116,12 @@ DRAWINGS: dict[str, tuple[_Shape, tuple[float, float, float], tuple[float, float
 def drawing(person: Person, seed: int, *, duration: float = 12.0, kind: str = "circle") -> Truth:
     r"""Return the motion of a person who draws a shape repeatedly with the right hand.
 
-    The angle along the shape is :math:`\omega\,s(t)`. The warped time s is constant during the first second and at the
-    end; in between, s advances as fast as the time t. In the transitions, the rate of s follows a minimum-jerk profile.
+    At time t, the hand is at the angle :math:`\omega\,s(t)` of the shape; :math:`\omega` is the angular frequency
+    [rad/s]. The warped time s is constant during the first second and at the end. In between, s advances as fast as t.
+    In the two transitions, ds/dt follows a minimum-jerk profile between 0 and 1.
 
     Args:
-        person: who moves.
+        person: the person who moves.
         seed: seed of the shape's random position, size and period.
         duration: duration of the motion [s]; the hand is at rest during the first second.
         kind: shape, one of :data:`DRAWINGS`.

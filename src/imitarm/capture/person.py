@@ -50,7 +50,8 @@ class Person:
     An arm consists of two straight bones with lengths :math:`L_U` and :math:`L_F`. For a given shoulder S and wrist W,
     the elbow E lies on a circle about the line from S to W. Let :math:`\hat w` be the unit vector along this line, and
     :math:`\hat d` and :math:`\hat o` two unit vectors perpendicular to it. When the arm points forward, :math:`\hat d`
-    points down and :math:`\hat o` points outwards; both rotate with the arm. The elbow is at
+    points down and :math:`\hat o` points outwards; both vectors rotate with the arm. The swivel angle :math:`\psi` says
+    where on the circle the elbow is:
 
     .. math:: E = S + a\,\hat w + h\,(\cos\psi\,\hat d + \sin\psi\,\hat o), \qquad
               a = \frac{L_U^2 + r^2 - L_F^2}{2r},\quad h = \sqrt{L_U^2 - a^2},\quad r = |W - S| .

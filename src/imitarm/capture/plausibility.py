@@ -48,8 +48,9 @@ def time_unit_that_fits(rate: float, unit: float) -> tuple[str, float] | None:
         rate: frame rate that results if the time stamps are in ``unit`` [Hz].
         unit: unit in which the time stamps were read, given by its length [s].
 
-    Returns: The name of the unit, and the factor by which the times that were read must be multiplied; None when no
-        unit other than ``unit`` gives a plausible frame rate.
+    Returns:
+        The name of the unit, and the factor by which the times that were read must be multiplied; None when no unit
+        other than ``unit`` gives a plausible frame rate.
     """
     low, high = PLAUSIBLE_RATE
     fits = [
@@ -69,7 +70,7 @@ def length_unit_that_fits(limb: float) -> str | None:
     """Return the unit of length in which a limb has a plausible length; None when no unit fits.
 
     Args:
-        limb: length of an upper arm or a forearm as a number in a file; read in metres, the number is not plausible.
+        limb: length of an upper arm or a forearm in the file's unknown unit; a number that is implausible in metres.
     """
     low, high = PLAUSIBLE_LIMB
     fits = [name for name, unit in _LENGTH_UNITS.items() if low <= limb * unit <= high]
@@ -163,7 +164,8 @@ def hand_speed(times: Array, positions: Array, spikes: Mask) -> float:
         positions: shape (n, 25, 3) [m].
         spikes: whether each joint is in a spike, shape (n, 25).
 
-    Returns: The speed; nan when fewer than 10 speeds can be computed for each hand.
+    Returns:
+        The speed; nan when neither hand has at least 10 mean speeds.
     """
     speeds = []
     for wrist in (JOINT[f"wrist_{side}"] for side in SIDES):

@@ -34,21 +34,21 @@ _GAP: Final = 0.25  # [s] a longer gap in a recording is not filled with frames
 
 
 class SkeletonRecording(SkeletonSource):
-    """Skeletons in the order in which they were recorded; as a source, a recording is replayed once.
+    """Skeletons in the order in which they were recorded. A recording is also a source, which replays them once.
 
     Skeletons are neither checked nor changed: times may decrease, and there may be several persons.
     :func:`~imitarm.capture.checks.check` lists the faults.
 
     Args:
         skeletons: skeletons in the order in which they were recorded.
-        name: name for messages, for example the file's name.
+        name: name of the recording in messages, for example the file's name.
         realtime: whether to replay at the recorded speed; otherwise as fast as skeletons are read.
-        issues: issues found while reading.
+        issues: issues found while the file was read.
         time_unit: length of the unit of the file's time stamps [s]; used in messages about implausible times.
 
     Attributes:
         skeletons: all skeletons, in the order in which they were recorded.
-        issues: issues found while reading.
+        issues: issues found while the file was read.
         time_unit: length of the unit of the file's time stamps [s].
     """
 
@@ -193,7 +193,7 @@ def read_recording(path: str | Path, *, realtime: bool = False) -> SkeletonRecor
     The format is detected from the content.
 
     Args:
-        path: the file; it may be the ``.part`` file of a recorder that was killed.
+        path: path of the file; also of the ``.part`` file that a killed recorder left.
         realtime: whether to replay at the recorded speed.
 
     Raises:

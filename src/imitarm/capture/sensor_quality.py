@@ -50,7 +50,7 @@ class SensorNoise:
         median_interval: median time between frames [s].
         jitter: standard deviation of the time between frames, excluding late frames [s].
         late: fraction of the intervals that are longer than 1.4 times the median interval.
-        longest_interval: [s].
+        longest_interval: longest time between two frames [s].
         at_rest: white noise of each joint while it moves slower than 0.1 m/s, as the root mean square over the three
             axes, shape (25,) [m]; nan if there are too few frames in which the joint moves so slowly.
         in_motion: white noise of each joint while it moves faster than 0.4 m/s, shape (25,) [m].
@@ -149,7 +149,7 @@ _LIMBS = {"upper arm": (0, 1), "forearm": (1, 2)}
 
 
 def guarded(recording: SkeletonRecording) -> SkeletonRecording:
-    """Return a recording filtered by :class:`SideFilter`, as a retargeter receives it."""
+    """Return the recording after :class:`SideFilter`, which also filters the skeletons that a retargeter receives."""
     return SkeletonRecording(list(SideFilter(recording)), name=recording.name)
 
 
@@ -159,7 +159,10 @@ def tracked_fraction(recording: SkeletonRecording, side: str) -> float:
 
 
 def bone(recording: SkeletonRecording, side: str, name: str) -> tuple[float, float]:
-    """Return the median length of ``"upper arm"`` or ``"forearm"`` [m], and its robust relative standard deviation."""
+    """Return the median length of ``"upper arm"`` or ``"forearm"`` [m], and its robust relative standard deviation.
+
+    The standard deviation is estimated from the median absolute deviation, and is divided by the median length.
+    """
     arms = [skeleton.arm(side) for skeleton in recording.skeletons]
     inner, outer = _LIMBS[name]
     lengths = np.array([np.linalg.norm(a.points[outer] - a.points[inner]) for a in arms if a.confidence[:3].min() >= 1])

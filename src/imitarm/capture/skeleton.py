@@ -1,4 +1,4 @@
-"""Skeleton: the joints of a person at one time, as a camera reports them. SkeletonSource: delivers skeletons."""
+"""Skeleton: the joints of a person at one time, as a camera reports them. SkeletonSource: a source of skeletons."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ JOINTS = (
 """Names of the 25 joints, in the order of the Kinect v2 SDK; left and right are the person's left and right."""
 
 JOINT = {name: index for index, name in enumerate(JOINTS)}
-"""Index of each joint."""
+"""Index of each joint in :data:`JOINTS`, by name."""
 
 SIDES = ("left", "right")
 FARTHEST = 20.0  # [m] beyond the range of any skeleton camera: a joint farther away was not measured
@@ -86,8 +86,8 @@ class Arm:
     """One arm of a person at one time, in the sensor's frame.
 
     Attributes:
-        time: [s].
-        points: shoulder, elbow, wrist, hand, hand tip, thumb, shape (6, 3) [m]; nan where lost.
+        time: time of the exposure, on the source's clock [s].
+        points: positions of shoulder, elbow, wrist, hand, hand tip, thumb, shape (6, 3) [m]; nan where lost.
         confidence: confidence of each point, 0 (lost) to 1 (tracked), shape (6,).
         hand_state: open, closed, or unknown.
     """
@@ -233,7 +233,7 @@ class SkeletonSource(ABC):
         glove = "my_package.glove:GloveSource"
 
     Attributes:
-        name: name for messages and for recordings, for example the file's name.
+        name: name of the source in messages and in recordings, for example the file's name.
         argument: text that a user writes after the colon, for example ``"SEED"``; empty if there is no colon.
         description: one line that describes the source in ``--help``.
         live: whether the source runs until it is stopped.

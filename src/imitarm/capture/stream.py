@@ -20,7 +20,7 @@ _LONGEST_WAIT = 60_000_000_000  # [ns] the longest that a datagram can state
 class SkeletonSender:
     """Sends skeletons to one address, each in one datagram, without waiting for an answer.
 
-    A lost datagram is not sent again, because the next skeleton follows within 1/30 s.
+    A lost datagram is not sent again, because the next skeleton follows about 1/30 s later.
 
     Args:
         address: host and port of the receiver.
@@ -83,8 +83,8 @@ class Arrival(NamedTuple):
 
     Attributes:
         waited: time between exposure and sending [s].
-        queued: time between sending and receiving [s]; for a sender on another machine, this time minus the shortest
-            such time of the last one to two minutes.
+        queued: time between sending and receiving [s]. If the sender runs on another machine, with another clock, the
+            shortest such time of the last one to two minutes is subtracted.
         received_ns: time of receiving, on this machine's clock [ns].
     """
 
@@ -99,7 +99,7 @@ class UdpSource(SkeletonSource):
     A :class:`~imitarm.transmission.datagram_filter.DatagramFilter` drops and counts datagrams that are late, damaged,
     hostile, or from another sender. A sender that is killed and started again is accepted after half a second of
     silence. The time stamps of a restarted sender are shifted so that they keep increasing after the restart. While the
-    sender is silent, every retargeter stops the robot; when skeletons arrive again, it follows the person again.
+    sender is silent, every retargeter stops its robot. When skeletons arrive again, the robot follows the person again.
 
     Args:
         port: port to listen on; 0: any free port.

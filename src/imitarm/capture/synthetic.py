@@ -1,4 +1,4 @@
-"""SyntheticSource: skeletons of a synthetic person, measured by a simulated camera; seeded."""
+"""SyntheticSource: skeletons of a synthetic person, measured by a simulated camera; a seed determines both."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ MOTIONS: dict[str, Callable[..., Truth]] = {
     **{kind: partial(reaching, kind=kind) for kind in REACHES},
     **{kind: partial(drawing, kind=kind) for kind in DRAWINGS},
 }
-"""Kinds of motion, by name: functions of a synthetic person, a seed and a ``duration`` [s] that return a motion."""
+"""Kinds of motion, by name: each function takes a synthetic person, a seed and ``duration`` [s], and returns a
+motion."""
 
 
 class SyntheticSource(SkeletonSource):
@@ -31,9 +32,9 @@ class SyntheticSource(SkeletonSource):
     Args:
         truth: true positions of all joints, as a function of time.
         camera: the simulated camera.
-        duration: [s].
+        duration: duration of the motion [s].
         realtime: whether to return the skeletons in real time, as a camera does; otherwise as fast as they are read.
-        name: name for messages.
+        name: name of the source in messages.
 
     Attributes:
         truth: function that returns the true positions of all joints at a time [s].

@@ -79,7 +79,7 @@ def _explained(error: BaseException) -> tuple[str, int]:
     if isinstance(error, OSError):
         return str(error), ImitarmError.exit_status
     what = f"{type(error).__name__}: {error}".removesuffix(": ")
-    return f"this is a bug in imitarm, please report it ({what}); IMITARM_DEBUG=1 shows where", 1
+    return f"this is a bug in imitarm, please report it ({what}); IMITARM_DEBUG=1 shows where it happened", 1
 
 
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:

@@ -34,7 +34,7 @@ from imitarm.policies import POLICIES
 from imitarm.policies.adaptation import ADAPTERS
 
 OTHERS = (add_static, add_moving, add_tracking, add_perception)
-"""Benchmarks with a file of their own: the functions that add their parsers."""
+"""Functions that add the parsers of those benchmarks that have a file of their own."""
 
 EPILOG = """\
 examples:
@@ -59,7 +59,7 @@ examples:
   imitarm benchmark moving compare moving --report moving.html
 
 'mapping' saves each result in the folder --out, and 'placements' in the file --out.
-If one of them was interrupted, the same command continues where it stopped.
+If you interrupt one of these two commands, the same command later continues where it stopped.
 """
 
 
@@ -78,7 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "developing methods, the other persons for testing them",
     )
     mapping.add_argument(
-        "--repeats", type=int, metavar="N", help="closed-loop trials of each person; default: 5 (1 with --quick)"
+        "--repeats", type=int, metavar="N", help="trials in which a person steers; default: 5 each (1 with --quick)"
     )
     mapping.add_argument("--quick", action="store_true", help="use a few short recordings, for a quick test")
     mapping.add_argument(
@@ -91,13 +91,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     mapping.add_argument(
         "--sigma", type=float, metavar="MM", help="standard deviation of the camera's error; default: 10 to 20 mm"
     )
-    mapping.add_argument("--no-live", action="store_true", help="use recordings only, without closed-loop trials")
-    mapping.add_argument("--no-replay", action="store_true", help="use closed-loop trials only, without recordings")
+    mapping.add_argument(
+        "--no-live", action="store_true", help="use recordings only, no trials in which a simulated person steers"
+    )
+    mapping.add_argument("--no-replay", action="store_true", help="use only trials in which a simulated person steers")
     mapping.add_argument(
         "--data",
         type=Path,
         metavar="DIR",
-        help="folder of real recordings; adds the captured arm (motion capture of a real person)",
+        help="folder of real recordings; the arm of a real person, recorded by motion capture, is then added",
     )
     mapping.add_argument("--out", type=Path, metavar="DIR", help="folder of the results; default: benchmark-mapping")
     mapping.add_argument("--report", type=Path, metavar="FILE", help="write a page with figures and playback (HTML)")
@@ -119,7 +121,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_fill(other)
     other.set_defaults(benchmark=_avoidance)
     third = parsers.add_parser(
-        "refusals", help="check in random scenes, with an independent oracle, whether paths and refusals are correct"
+        "refusals",
+        help="check whether paths and refusals are correct, by an independent search (oracle) in random scenes",
     )
     third.add_argument("--scenes", type=int, default=1000, metavar="N", help="how many; default: 1000")
     third.add_argument("--first", type=int, default=0, metavar="N", help="first seed; default: 0")
@@ -154,7 +157,7 @@ def _add_placements(parsers: Any) -> None:
         metavar="FILE",
         help="skill files; default: the skill 'sweep' of the package, with Sawyer and brush",
     )
-    placed.add_argument("--robots", nargs="+", metavar="NAME", help="several arms instead of --robot")
+    placed.add_argument("--robots", nargs="+", metavar="NAME", help="use several arms; replaces --robot")
     placed.add_argument("--policies", nargs="+", choices=POLICIES, default=["acfra"], metavar="NAME")
     placed.add_argument("--seeds", type=int, default=50, metavar="N", help="number of placements; default: 50")
     placed.add_argument("--first", type=int, default=2000, metavar="N", help="first seed; default: 2000")

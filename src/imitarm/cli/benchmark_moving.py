@@ -57,17 +57,19 @@ def add_moving(parsers: Any) -> None:
         ("rate", 30.0, "HZ", "rate of the sensor"),
         ("latency", 33.0, "MS", "delay of the sensor"),
         ("dropout", 0.0, "PERCENT", "probability that an obstacle is missed in a frame"),
-        ("occlusions", 0.0, "HZ", "occlusions of 0.5 s per second"),
+        ("occlusions", 0.0, "HZ", "number of occlusions per second; each lasts 0.5 s"),
     ):
         moving.add_argument(
             f"--{name}", nargs="+", type=float, default=[default], metavar=unit, help=f"{text}; default: {default:g}"
         )
-    moving.add_argument("--out", type=Path, default=_FOLDER, metavar="DIR", help=f"of the results; default: {_FOLDER}")
+    moving.add_argument(
+        "--out", type=Path, default=_FOLDER, metavar="DIR", help=f"folder of results; default: {_FOLDER}"
+    )
     moving.add_argument("--fresh", action="store_true", help="ignore saved results and run all experiments again")
     moving.add_argument("--reuse", action="store_true", help="use saved results even if other code made them")
     add_workers(moving)
     moving.set_defaults(benchmark=_run)
-    actions = moving.add_subparsers(metavar="ACTION", title="actions; without one, the experiments are run")
+    actions = moving.add_subparsers(metavar="ACTION", title="actions; if none is given, the experiments are run")
     comparison = actions.add_parser("compare", help="print the tables of saved results")
     comparison.add_argument("folders", type=Path, nargs="+", metavar="FOLDER", help="folders of results")
     comparison.add_argument("--report", type=Path, metavar="FILE", help="write a page with figures and playback (HTML)")
@@ -79,10 +81,11 @@ def add_moving(parsers: Any) -> None:
 
 
 def experiments_of(arguments: argparse.Namespace) -> list[MovingExperiment]:
-    """Return the experiments that the options describe; those of one scene are neighbours.
+    """Return the experiments that the options describe; experiments in the same scene follow one another.
 
     Raises:
-        InputError: when an option is out of range, or the recordings for M10 are missing although M10 was named.
+        InputError: when an option is out of range, or M10 (scenes from recorded motions) is named and the recordings
+            are missing.
     """
     if arguments.count < 1 or arguments.first < 0:
         raise InputError(f"--count must be at least 1 and --first at least 0: {arguments.count}, {arguments.first}")

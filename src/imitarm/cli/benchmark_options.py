@@ -1,4 +1,4 @@
-"""Options and output that the benchmarks have in common: processes, tables, and documents to fill."""
+"""Options and output that the benchmarks have in common: processes, tables, and documents that receive the tables."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ def workers_of(arguments: argparse.Namespace) -> Workers:
 
 @dataclass(frozen=True)
 class Finished(Generic[Outcome]):
-    """What running experiments gave.
+    """Results of the experiments of one command.
 
     Attributes:
         outcomes: all results, in the order of the experiments.
-        kept: number of results that were saved before.
+        kept: number of results that an earlier run had saved.
         seconds: duration of the run [s].
     """
 
@@ -58,10 +58,12 @@ class Finished(Generic[Outcome]):
 
     @property
     def summary(self) -> str:
-        """A sentence about the run."""
+        """Number, duration and rate of the experiments, as one sentence."""
         ran = len(self.outcomes) - self.kept
         speed = 60.0 * ran / self.seconds
-        return f"{ran} experiments in {self.seconds:.0f} s: {speed:.0f} per minute; {self.kept} were saved before"
+        return (
+            f"{ran} experiments in {self.seconds:.0f} s: {speed:.0f} per minute; {self.kept} results were saved before"
+        )
 
 
 def run_with_progress(
@@ -73,7 +75,7 @@ def run_with_progress(
     *,
     fresh: bool,
 ) -> Finished[Outcome]:
-    """Run experiments with a progress bar; results that were saved before are used unless ``fresh`` is set.
+    """Run experiments with a progress bar; results of an earlier run are used unless ``fresh`` is set.
 
     The bar is called ``name``. The other arguments are those of :func:`~imitarm.benchmark.running.run_experiments`.
     """
@@ -91,13 +93,13 @@ def run_with_progress(
 
 
 def add_fill(parser: argparse.ArgumentParser) -> None:
-    """Add the option that names a document to fill with tables."""
+    """Add the option that names a document into which the tables are written."""
     text = "put the tables into this document, between the lines '<!-- imitarm benchmark NAME -->' and '<!-- end -->'"
     parser.add_argument("--fill", type=Path, metavar="FILE", help=text)
 
 
 def place_of(arguments: argparse.Namespace, benchmark: str) -> Place | None:
-    """Return the document to fill with tables, after checking that it can be filled; None if no document is given."""
+    """Check that the tables can be written into the document, and return its place; None if no document is given."""
     return None if arguments.fill is None else Place(arguments.fill, benchmark)
 
 
@@ -114,7 +116,7 @@ def report_tables(found: Sequence[Table], place: Place | None, versions: Sequenc
 
 
 def command_line() -> str:
-    """Return the command line without file names that apply only to this machine."""
+    """Return the command line, without names of files that exist only on this machine."""
     words, places = (
         sys.argv[1:],
         {"--out", "--report", "--fill", "--json", "--markdown", "--jobs", "--backend", "--scheduler"},

@@ -41,7 +41,7 @@ from imitarm.errors import InputError
 
 _FOLDER = Path("benchmark-static")
 COVERED = "S6"
-"""The family whose scenes must all be refused."""
+"""Family of scenes in which no path exists, so that every method must refuse to move."""
 _SETTINGS = ("default", "tuned")
 
 
@@ -62,7 +62,7 @@ def add_static(parsers: Any) -> None:
         nargs="+",
         default=[1],
         metavar="N",
-        help="teachers of the skills; default: 1",
+        help="number of synthetic teachers of a skill; default: 1",
     )
     static.add_argument(
         "--skill",
@@ -79,21 +79,23 @@ def add_static(parsers: Any) -> None:
     )
     _add_running(static)
     static.set_defaults(benchmark=_run)
-    actions = static.add_subparsers(metavar="ACTION", title="actions; without one, the experiments are run")
-    tuning = actions.add_parser("tune", help="search the options of the methods on validation scenes")
+    actions = static.add_subparsers(metavar="ACTION", title="actions; if none is given, the experiments are run")
+    tuning = actions.add_parser("tune", help="search for the best options of each method on validation scenes")
     solvable = [family for family in FAMILIES if family != COVERED]  # no draw could succeed in the others
     _add_scenes(tuning, count=5, split="validation", families=solvable)
-    tuning.add_argument("--draws", type=int, default=DRAWS, metavar="N", help=f"for each method; default: {DRAWS}")
+    tuning.add_argument("--draws", type=int, default=DRAWS, metavar="N", help=f"trials per method; default: {DRAWS}")
     tuning.add_argument("--save", type=Path, metavar="FILE", help="file of the best options; default: DIR/tuned.json")
     _add_running(tuning)
     tuning.set_defaults(benchmark=_tune)
-    scaling = actions.add_parser("scaling", help="measure time and success with 1 to 20 obstacles and 1 to 16 spheres")
+    scaling = actions.add_parser("scaling", help="vary the number of obstacles (1 to 20) and of tool spheres (1 to 16)")
     scaling.add_argument("--methods", nargs="+", default=[OURS], metavar="NAME", help=f"default: {OURS}")
-    scaling.add_argument("--count", type=int, default=10, metavar="N", help="scenes for each number; default: 10")
+    scaling.add_argument(
+        "--count", type=int, default=10, metavar="N", help="scenes for each of these numbers; default: 10"
+    )
     scaling.add_argument("--first", type=int, default=2000, metavar="N", help="first seed; default: 2000")
     add_fill(scaling)
     scaling.set_defaults(benchmark=_scaling)
-    refusals = actions.add_parser("refusals", help=f"check every refusal of {OURS} with the oracle")
+    refusals = actions.add_parser("refusals", help=f"check by a search (oracle) that {OURS} refused rightly")
     _add_scenes(refusals, count=100, split="test", methods=False)
     _add_running(refusals)
     add_fill(refusals)
@@ -144,7 +146,9 @@ def _add_scenes(
 
 
 def _add_running(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=Path, default=_FOLDER, metavar="DIR", help=f"of the results; default: {_FOLDER}")
+    parser.add_argument(
+        "--out", type=Path, default=_FOLDER, metavar="DIR", help=f"folder of results; default: {_FOLDER}"
+    )
     parser.add_argument("--fresh", action="store_true", help="ignore saved results and run all experiments again")
     parser.add_argument("--reuse", action="store_true", help="use saved results even if other code made them")
     add_workers(parser)
@@ -158,7 +162,7 @@ def _scenes(arguments: argparse.Namespace) -> list[tuple[str, int, int]]:
 
 
 def experiments_of(arguments: argparse.Namespace) -> list[StaticExperiment]:
-    """Return the experiments that the options ask for; those of one scene are neighbours."""
+    """Return the experiments that the options describe; experiments in the same scene follow one another."""
     found: dict[StaticExperiment, None] = {}
     for skill, scene in _scenes_of_skills(arguments):
         number = scene[2] - arguments.first
@@ -216,7 +220,7 @@ def _run(arguments: argparse.Namespace) -> int:
     for row in results.rows:
         slope, error, n = cost_law(results, row)
         if row.split(",")[0] == OURS and n > 2:
-            say(f"{row}: processor time ~ obstacles^{slope:.2f}, standard error {error:.2f}")
+            say(f"{row}: processor time grows as obstacles^{slope:.2f}, standard error of the exponent {error:.2f}")
     say(f"compare the methods: imitarm benchmark static compare {arguments.out}")
     return 0
 
@@ -225,7 +229,9 @@ def _tune(arguments: argparse.Namespace) -> int:
     """Search the options of the methods, and write the best ones."""
     scenes, (_, end) = _scenes(arguments), SPLITS["validation"]
     if arguments.first < SPLITS["validation"][0] or arguments.first + arguments.count > end:
-        remark("the scenes are not validation scenes: options that are tuned on test scenes must not be tested on them")
+        remark(
+            "the scenes are not validation scenes: options tuned on test scenes must not be tested on the same scenes"
+        )
     search = Search(tuple(scenes), arguments.draws)
     methods = arguments.methods or [m for m in method_names() if len(search.options(m)) > 1]
     store = RESULTS.store(arguments.out, reuse=arguments.reuse)

@@ -1,4 +1,4 @@
-"""``imitarm benchmark tracking``: the obstacle tracker on real motion, and the coverage of margins."""
+"""``imitarm benchmark tracking``: how well the tracker follows real motion, and how often its margins suffice."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from imitarm.errors import InputError
 def add_tracking(parsers: Any) -> None:
     """Add the parser of the command."""
     parser = parsers.add_parser(
-        "tracking", help="measure the obstacle tracker on real motion, and the coverage of margins (thesis Fig 5.9)"
+        "tracking",
+        help="measure how well the tracker follows real motion, and how often its margins suffice (thesis Fig 5.9)",
     )
     parser.add_argument(
         "--data",
@@ -29,7 +30,7 @@ def add_tracking(parsers: Any) -> None:
         help="folder of real recordings, with the subfolders mocap_arm and mocap_trolley",
     )
     parser.add_argument(
-        "--windows", type=int, default=5000, metavar="N", help="synthetic windows for the margins; default: 5000"
+        "--windows", type=int, default=5000, metavar="N", help="short synthetic motions for the margins; default: 5000"
     )
     parser.add_argument(
         "--noise", type=float, default=5.0, metavar="MM", help="standard deviation of the detections; default: 5"
@@ -37,7 +38,7 @@ def add_tracking(parsers: Any) -> None:
     parser.add_argument(
         "--dropout", type=float, default=20.0, metavar="%", help="percentage of missed detections; default: 20"
     )
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the simulated sensor; default: 0")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the sensor; default: 0")
     parser.add_argument("--report", type=Path, metavar="FILE", help="write a page with figures (HTML)")
     add_fill(parser)
     parser.set_defaults(benchmark=_run)

@@ -143,7 +143,7 @@ def _limbs(arguments: argparse.Namespace, before: Calibration) -> Calibration:
                 if lengths.accepted:
                     break
                 fault = (
-                    f"limb lengths: the standard error is {1e3 * lengths.standard_error:.0f} mm, at most "
+                    f"limb lengths: the standard error is {1e3 * lengths.standard_error:.0f} mm, but at most "
                     f"{1e3 * ACCEPTED:.0f} mm are accepted; measure for longer, in better light"
                 )
             except InputError as error:
@@ -230,7 +230,10 @@ def _show_sensor(fit: SensorFit) -> None:
         [
             ("position", f"{x:.1f} {y:.1f} {z:.1f} cm"),
             ("residuals of the points", f"{1e2 * fit.rms:.2f} cm (RMS), {1e2 * fit.residuals.max():.2f} at most"),
-            ("error of the rotation", f"{57.29578 * fit.angle_error:.2f} degrees (condition {fit.condition:.1f})"),
+            (
+                "error of the rotation",
+                f"{57.29578 * fit.angle_error:.2f} degrees (condition number {fit.condition:.1f})",
+            ),
         ],
     )
     for note in fit.notes():
@@ -316,7 +319,7 @@ def touched_points(
     *,
     only: int | None = None,
 ) -> dict[int, list[float]]:
-    """Ask the user to put a hand on the robot's tool at one point after the other, and measure the hand's position.
+    """Ask the user to put a hand on the robot's tool at each of several points, and measure the hand's position.
 
     If the hand moved or was not seen, the measurement is repeated.
 
@@ -338,7 +341,7 @@ def touched_points(
         if len(points) < LEAST_PAIRS:
             raise InputError(f"sensor calibration: {len(points)} points, at least {LEAST_PAIRS} are needed; add more")
         remark(
-            f"{len(points)} points. At each point, bring the robot's tool there, and put the palm of your {side} "
+            f"Move the robot's tool to each of the {len(points)} points, and there put the palm of your {side} "
             f"hand on the tool's tip."
         )
         remark("The sensor must see the hand. Then hold still and press Enter. Type s to skip a point, q to quit.")

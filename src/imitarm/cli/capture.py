@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     output.add_argument(
         "--repair",
         action="store_true",
-        help="fix clear faults: several persons, wrong order, repeated frames, spikes, exchanged left and right sides",
+        help="fix clear faults: several persons, wrong order, repeated frames, spikes, swapped left and right sides",
     )
 
 

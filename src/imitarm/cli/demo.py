@@ -33,9 +33,9 @@ examples:
 
 The package contains eight demonstrations of a sweep, in which a synthetic teacher guides the simulated Sawyer by hand.
 The command checks and aligns the demonstrations, and learns a skill from them.
-The command then reproduces the skill without obstacles, in four scenes with standing obstacles and in two with
-moving obstacles, or in the scenes of --scenes.
-Moving obstacles are observed with a simulated sensor (noise of 5 mm, 30 Hz, 33 ms late) and a tracker.
+The command then reproduces the skill in seven scenes: one without obstacles, four with standing obstacles and two
+with moving obstacles. With --scenes, it uses the scenes that you name instead.
+A simulated sensor and a tracker observe the moving obstacles (noise 5 mm, 30 frames per second, 33 ms delay).
 T1 to T8 are eight scenes with two to four obstacles, modelled on the eight tasks of the thesis (Table 4.1).
 The command writes skill.json, report.html (opens offline in any browser) and results.json to FOLDER.
 The command replaces existing files only with --force.
@@ -68,8 +68,8 @@ _CAPTIONS = {
     "cone_first": "A cone and a box stand on the learned path, and a large box narrows the space around them.",
     "box_and_cone": "A flat box and a cone stand on the learned path, one in front of the crumbs and one behind them.",
     "three_boxes": "Two boxes stand on the learned path, and a large box narrows the space beside the second one.",
-    "two_boxes_two_cones": "A box and a cone stand on the learned path, and another pair narrows the space there.",
-    "three_boxes_and_cone": "A box and a cone stand on the learned path, with a box on the other side of each of them.",
+    "two_boxes_two_cones": "A box and a cone stand on the learned path; another box and cone narrow the space.",
+    "three_boxes_and_cone": "A box and a cone stand on the learned path; opposite each of them stands another box.",
 }
 
 

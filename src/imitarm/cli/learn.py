@@ -1,4 +1,4 @@
-"""``imitarm learn``: from files of demonstrations to a skill file."""
+"""``imitarm learn``: learn a skill from files of demonstrations, and write the skill to a file."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--each-path",
         action="store_true",
-        help="if the demonstrations take different paths between the same ends, learn one skill from each group and "
-        "number the skill files",
+        help="if the demonstrations take different paths from the same start to the same goal, learn one skill for "
+        "each path, and number the skill files",
     )
     parser.add_argument(
         "--allow-errors", action="store_true", help="learn and write the skill even if the checks find errors"

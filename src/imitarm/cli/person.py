@@ -1,4 +1,4 @@
-"""The common part of all commands that read a person from a source: arguments, reading, and printing of issues."""
+"""Arguments, reading and printing of issues, for all commands that read a person's motion from a source."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ def person_of(arguments: argparse.Namespace, side: str) -> tuple[list[Skeleton],
     notes += [str(issue) for issue in check(recording, side)]
     begin, pace = recording.skeletons[0].time, arguments.pace
     if pace != 1.0:
-        notes.append(f"slowed to {100 * pace:g} % of its speed")
+        notes.append(f"slowed the recording to {100 * pace:g} % of its speed")
     for line in notes:
         remark(line)
     return slowed(recording.skeletons, pace), notes, None if truth is None else _slow(truth, begin, pace)

@@ -1,4 +1,4 @@
-"""The arguments of all commands that read demonstrations, and the function that reads files as these arguments say."""
+"""Arguments for all commands that read demonstrations, and the function that reads the files by these arguments."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
         "files", nargs="+", metavar="FILE", help=f"demonstrations, or folders of them; formats: {', '.join(READERS)}"
     )
     unsaid = parser.add_argument_group("for values that the files do not state")
-    unsaid.add_argument("--units", choices=LENGTH_UNITS, help="unit of lengths; default: as the file states, else m")
+    unsaid.add_argument("--units", choices=LENGTH_UNITS, help="unit of lengths; default: what the file states, else m")
     unsaid.add_argument(
-        "--time-units", choices=TIME_UNITS, help="unit of time stamps; default: as the file states, else s"
+        "--time-units", choices=TIME_UNITS, help="unit of time stamps; default: what the file states, else s"
     )
     unsaid.add_argument(
         "--duration", type=float, metavar="S", help="duration of each motion in seconds, for files without time stamps"
@@ -39,7 +39,7 @@ def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
     unsaid.add_argument(
         "--quaternion-order",
         choices=QUATERNION_ORDERS,
-        help="order of quaternion columns without names; default: as the file states, else wxyz",
+        help="order of quaternion columns without names; default: what the file states, else wxyz",
     )
     parser.add_argument("--thin", action="store_true", help="drop rows that only repeat the previous row")
     parser.add_argument(
@@ -106,9 +106,9 @@ def show_findings(raw: Sequence[RawDemonstration], findings: Sequence[Finding], 
 
     Args:
         raw: the demonstrations that were read.
-        findings: about them.
-        every: whether to print one row for each finding; if False, one row for each kind of finding, with the number of
-            findings.
+        findings: findings about these demonstrations.
+        every: whether to print one row for each finding. Otherwise, one row is printed for each kind of finding, with
+            the number of findings of this kind.
     """
     groups = [[f] for f in findings] if every else _kinds(findings)
     if findings:
@@ -136,7 +136,7 @@ def _row(group: Sequence[Finding]) -> tuple[str, ...]:
     where = first.source or "all"
     if len(sources) > 1:
         where += f" and {_number(len(sources) - 1, 'other')}"
-    message = first.message if len(group) == 1 else f"{len(group)} of this kind; the first: {first.message}"
+    message = first.message if len(group) == 1 else f"{len(group)} findings of this kind; the first: {first.message}"
     return first.severity, where, first.place, first.code, as_options(message), as_options(first.remedy)
 
 

@@ -113,13 +113,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--goal-tilt",
         type=float,
         metavar="DEG",
-        help="largest rotation of the tool away from the learned one at the goal, used only where the arm is not clear "
-        "at the goal without it; default: 0",
+        help="largest rotation of the tool away from the learned one at the goal; the tool is rotated there only if "
+        "the arm would otherwise be too close to an obstacle; default: 0",
     )
     held = avoid.add_mutually_exclusive_group()
     held.add_argument("--keep-height", action="store_true", help="move the path only sideways, as on a table")
     held.add_argument("--not-down", action="store_true", help="never move the path downwards")
-    moved = parser.add_argument_group("other start and goal")
+    moved = parser.add_argument_group("different start and goal")
     triple: Any = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
     moved.add_argument("--start", **triple, help="start position of the tool [cm]; default: as learned")
     moved.add_argument(
@@ -235,7 +235,9 @@ def _policy(arguments: argparse.Namespace, skill: Skill, arm: ArmModel, spheres:
         value, option = getattr(arguments, name), f"--{name.replace('_', '-')}"
         if value is not None:
             if not whole_arm:
-                raise InputError(f"{option} limits the plan of the whole arm: leave out --tool-only and --tool-radius")
+                raise InputError(
+                    f"{option} applies only to a plan of the whole arm: leave out --tool-only and --tool-radius"
+                )
             options[name] = math.radians(finite_number(value, option, "degrees", at_least=0.0))
     if arguments.method is not None:
         if arguments.policy != "acfra":

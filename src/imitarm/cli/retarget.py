@@ -369,9 +369,9 @@ def suggestion(
     """If the tool did not follow its target, return the options to try, the most promising first; else an empty text.
 
     Args:
-        tracking: tracking result of the run.
+        tracking: how closely the tool followed its target in this run.
         skeletons: skeletons of the person.
-        correspondence: correspondence between person and robot, the input of the method.
+        correspondence: arm, scale and orientation by which the method related the person to the robot.
         fitted: whether ``--fit`` was given.
         pace: value of ``--pace``.
     """

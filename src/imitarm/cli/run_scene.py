@@ -151,7 +151,7 @@ def _distance_to(demonstrations: Sequence[Demonstration], rollout: Rollout | Non
 def learning_summary(
     skill: Skill, demonstrations: Sequence[Demonstration], findings: Sequence[Finding], alignment: Alignment | None
 ) -> LearningSummary:
-    """Return the content of the report about learning."""
+    """Return what the report says about the learning of the skill."""
     gmr = skill.gmr_
     predicted: Trajectory = gmr.trajectory(200)
     return LearningSummary(

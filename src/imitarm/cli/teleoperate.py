@@ -49,7 +49,7 @@ A robot of 'imitarm serve' is stopped at first, and moves only after you press E
 With --enable, the robot is enabled once at the start, without asking.
 The robot begins to follow a person who has been seen for half a second.
 Each recorded sample is written to FILE.part immediately, so that it can be read even if the process is killed.
-The exit status is 1 if the robot never followed a person, or could not be controlled any more.
+The exit status is 1 if the robot never followed a person, or could no longer be controlled.
 """
 
 _INTERRUPTED = "interrupted"
@@ -76,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_robot_options(parser)
     robot = parser.add_argument_group("control")
-    robot.add_argument("--to", metavar="HOST:PORT", help="use a served robot; default: simulate it in this process")
+    robot.add_argument("--to", metavar="HOST:PORT", help="use a robot of 'imitarm serve'; default: simulate one here")
     robot.add_argument("--enable", action="store_true", help="enable a stopped robot once at the start, without asking")
     robot.add_argument("--scene", type=Path, metavar="FILE", help="obstacles to avoid (YAML); default: none")
     robot.add_argument("--method", choices=sorted(RETARGETERS), default="modern", help="retargeter; default: modern")
@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     Raises:
         InputError: when an option, a file or the source is invalid.
-        TaskFailedError: when no robot answers, the robot can't be controlled any more, or it never followed a person.
+        TaskFailedError: when no robot answers, or the robot can no longer be controlled or never followed a person.
     """
     _check_options(arguments)
     correspondence = _correspondence(arguments)
@@ -149,7 +149,7 @@ def _check_options(arguments: argparse.Namespace) -> None:
     ]
     check_outputs([("--record", arguments.record), ("--latency", arguments.latency)], inputs, force=arguments.force)
     if arguments.enable and not arguments.to:
-        raise InputError("--enable applies to a served robot; give its address with --to, or omit --enable")
+        raise InputError("--enable applies to a robot of 'imitarm serve'; name its address with --to, or omit --enable")
 
 
 def _correspondence(arguments: argparse.Namespace) -> Correspondence:
@@ -234,7 +234,7 @@ def _raise_failure(summary: Summary, robot: Robot) -> None:
     """Raise TaskFailedError if the robot failed or never followed a person."""
     fault = robot.fault or (robot.problem if isinstance(robot, UdpRobot) and summary.reason == robot.problem else "")
     if fault:
-        raise TaskFailedError(f"the robot could not be controlled any more: {fault}")
+        raise TaskFailedError(f"the robot could no longer be controlled: {fault}")
     if not summary.engagement[EngagementState.FOLLOWING] and summary.reason != "stopped by the user":
         raise TaskFailedError(
             "the robot never followed a person: an arm must be seen for half a second; see 'imitarm capture --check'"
@@ -266,7 +266,7 @@ class EnablePrompt:
         threading.Thread(target=self._reading, daemon=True).start()
 
     def reset(self) -> None:
-        """Forget the last problem, which has ended. The user will be asked about the next problem."""
+        """Forget the last problem after it has ended, so that the user is asked about the next problem."""
         self._first, self._asked = False, ("", False)
 
     def __call__(self, problem: str, stopped: bool) -> bool:

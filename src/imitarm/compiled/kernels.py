@@ -1,4 +1,4 @@
-"""Building and loading the library of compiled code."""
+"""Build and load the library of compiled code."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _FUNCTIONS: dict[str, tuple[Any, ...]] = {
 
 
 def build() -> str:
-    """Compile all sources; return a sentence that says what was done."""
+    """Compile all sources, and return a sentence that describes the result."""
     compiler = next((path for name in _COMPILERS if (path := shutil.which(name))), None)
     if compiler is None:
         return "no C compiler was found; NumPy is used"
@@ -72,7 +72,7 @@ class Record:
 
     Arrays are given by their addresses, and lists by the address of a list of addresses, 0 for None.
 
-    The record keeps its fields. A copy in another process has addresses of its own.
+    The record keeps a reference to each field. A copy in another process contains the addresses of that process.
 
     Attributes:
         address: address of the structure.

@@ -1,4 +1,4 @@
-"""The control loop: reproduce a skill on a robot, and what is known of its surroundings."""
+"""The control loop: reproduce a skill on a robot, and observe the obstacles around the robot."""
 
 from imitarm.control_loop.camera_observer import CameraObserver
 from imitarm.control_loop.contact import Contact, ContactDetector

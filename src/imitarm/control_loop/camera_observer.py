@@ -1,4 +1,4 @@
-"""CameraObserver: cameras, an obstacle detector and a tracker as the ``observe`` of a control loop."""
+"""CameraObserver: combines cameras, a detector and a tracker into the function ``observe`` of a control loop."""
 
 from __future__ import annotations
 
@@ -31,38 +31,39 @@ class _Waiting(NamedTuple):
 
 
 class CameraObserver:
-    """The scene as cameras and a tracker know it; callable as ``observe(t)``.
+    """Observes a scene with cameras and a tracker; call it as ``observe(t)``.
 
-    At each period of the cameras, every camera takes an image. An image arrives after the latency: then the detector
-    finds the obstacles in it, and the tracker takes them in with the time stamp of the image. ``observe(t)`` returns
-    the tracks, predicted to ``t``. A camera may be fixed or on the wrist, because each image contains its own pose. The
-    joint positions are recorded at every call, so that the detector can remove the arm from each image where it was
-    when the image was taken.
+    At each period of the cameras, every camera takes an image. The image arrives after the latency. Then the detector
+    finds the obstacles in the image, and the tracker is updated with these obstacles and the time stamp of the image.
+    ``observe(t)`` returns the tracked obstacles, predicted to the time ``t``. A camera may be fixed or on the wrist,
+    because each image contains its own pose. The joint positions are recorded at every call. The detector removes the
+    arm from each image, and needs the joint positions of the time at which the image was taken.
 
-    **A frozen camera.** An image whose stamp is not newer than the one before is ignored. If the newest image is older
-    than ``max_age``, the scene is no longer predicted: its ``stamp`` stays that of the newest image, so that a watchdog
-    can see how old it is. Before the first image, the scene is empty and its stamp is that of the first call.
+    **A frozen camera.** An image is ignored unless its time stamp is later than the stamp of the previous image. If the
+    newest image is older than ``max_age``, the obstacles are no longer predicted, and the scene keeps the stamp of the
+    newest image. From this stamp, a watchdog can compute the age of the scene. Before the first image arrives, the
+    scene is empty, and its stamp is the time of the first call.
 
-    **A camera that was moved.** Once per second, the known surfaces in the image are compared with their true places
-    (:meth:`~imitarm.perception.ObstacleDetector.camera_error`). If they do not fit in two such images of one camera in
-    succession, the call raises an error, and the control loop brakes the robot.
+    **A camera that was moved.** Once per second, the surfaces in an image are compared with the known places of these
+    surfaces (:meth:`~imitarm.perception.ObstacleDetector.camera_error`). If two successive comparisons of one camera
+    disagree, the call raises an error, and the control loop brakes the robot.
 
-    Calls must be in the order of time, as a camera can't take images of the past.
+    The time must not decrease from one call to the next, because a camera can't take images of the past.
 
     Args:
         cameras: one function or several functions that return a new image, or None if there is none, for example
             ``DepthCamera.frame``.
-        detector: finds the obstacles.
-        tracker: an :class:`~imitarm.perception.ObstacleTracker`.
+        detector: detector that finds the obstacles in an image.
+        tracker: :class:`~imitarm.perception.ObstacleTracker` that receives these obstacles.
         joints: function that returns the current joint positions (n_joints,) [rad]; required if the detector removes an
             arm.
         rate: images per second of each camera [Hz].
         latency: time from the exposure to the arrival of an image [s].
         max_age: age of the newest image at which the cameras count as frozen [s].
-        clock: what the stamps of the images are ahead of the times of the calls [s], for example the stamp of the scene
-            in which a simulated robot started.
-        goal: goal of the scenes.
-        fixtures: fixtures of the scenes.
+        clock: stamp of an image minus the time of a call at the same instant [s]; for a simulated robot, the stamp of
+            the scene in which the robot started.
+        goal: goal of the returned scenes.
+        fixtures: fixtures (known obstacles that do not move) of the returned scenes.
 
     Attributes:
         n_frames: number of images that were used.
@@ -117,7 +118,7 @@ class CameraObserver:
 
     @property
     def stamp(self) -> float | None:
-        """Time of the newest image that was used, on the clock of the calls [s]; None before the first one."""
+        """Time of the newest image that was used, on the clock of the calls [s]; None before the first image."""
         return self._stamp
 
     def __call__(self, time: float) -> Scene:
@@ -130,8 +131,8 @@ class CameraObserver:
         time = finite_number(time, "CameraObserver: time", "s")
         if time < self._now:
             raise InputError(
-                f"CameraObserver: time {time:g} s is before the last call ({self._now:g} s); a camera can't look back. "
-                "Call reset() before a new run"
+                f"CameraObserver: time {time:g} s is earlier than in the last call ({self._now:g} s), but no image "
+                "shows the past. Call reset() before a new run"
             )
         self._now = time
         if self._joints is not None:

@@ -22,7 +22,7 @@ class Contact(NamedTuple):
     """A contact that the torques of the joints show.
 
     Attributes:
-        joint: name of the joint with the largest unexplained torque, in units of its threshold.
+        joint: name of the joint whose external torque is largest in relation to the joint's threshold.
         torque: external torque on this joint [N m].
         threshold: largest torque that does not count as a contact [N m].
         time: time on the robot's clock [s].
@@ -41,34 +41,37 @@ class Contact(NamedTuple):
 
 
 class ContactDetector:
-    r"""Detects contacts by the momentum observer, which estimates the external torques on the joints.
+    r"""Detects contacts from the external torques on the joints, which a momentum observer estimates.
 
-    The generalised momentum :math:`p = M(q)\,\dot q` changes by the torques of the drives :math:`\tau`, of gravity and
-    Coriolis forces, of friction :math:`\tau_f`, and by external torques :math:`\tau_e = J^T F`. The observer (De Luca,
-    Albu-Schaeffer, Haddadin and Hirzinger, "Collision detection and safe reaction with the DLR-III lightweight
-    manipulator arm", IROS 2006) compares the momentum with the integral of all torques but the external ones:
+    Let M be the mass matrix of the arm. The generalised momentum of the arm, :math:`p = M(q)\,\dot q`, changes because
+    of five torques. They come from the drives (:math:`\tau`), gravity (g), Coriolis forces (matrix C), friction
+    (:math:`\tau_f`), and an external force F (:math:`\tau_e = J^T F`). The observer (De Luca, Albu-Schaeffer, Haddadin
+    and Hirzinger, "Collision detection and safe reaction with the DLR-III lightweight manipulator arm", IROS 2006)
+    compares
+    the momentum with the integral of all torques except the external torques:
 
     .. math:: r = K \Big( p - \int (\tau - \tau_f + C^T \dot q - g + r)\, dt \Big), \qquad \dot r = K (\tau_e - r) .
 
-    The residual r therefore follows the external torque like a low-pass filter with the time constant 1/K, and no
-    acceleration has to be measured. Between two states at :math:`t_{k-1}` and :math:`t_k`, the change of the momentum
-    and the Coriolis and gravity terms are evaluated in the middle, where they add up to the inverse dynamics of the
-    mean acceleration. The thesis mentions torque sensors that "help the robot detect collision" (3.2.3), and says no
-    more about them.
+    The residual r is therefore the external torque after a low-pass filter with the time constant 1/K. The observer
+    needs no measured acceleration. For two states at :math:`t_{k-1}` and :math:`t_k`, the terms of momentum, Coriolis
+    forces and gravity are evaluated at the mean joint position. Together, these terms are the inverse dynamics for the
+    mean acceleration. The thesis mentions torque sensors that "help the robot detect collision" (3.2.3), but does not
+    describe how.
 
-    While a joint stands still, its dry friction can compensate an external torque, so the residual is uncertain by the
-    dry friction.
+    While a joint stands still, dry friction can balance an external torque. The residual is then uncertain by up to the
+    torque of the dry friction.
 
     Args:
-        arm: the arm with its tool, as the observer knows it. Masses are needed.
+        arm: model of the arm with its tool, including all masses.
         threshold: external torque of each joint that counts as a contact, one number or shape (n_joints,) [N m]; None:
-            0.15 times the rated torque (10 N m for a joint without one) plus the dry friction of the joint. This is
-            enough for a tool that is 5 % heavier than known, and for payloads of half a kilogram.
-        gain: K [1/s].
+            0.15 times the rated torque (10 N m for a joint without one) plus the dry friction of the joint. With this
+            default, no contact is reported if the tool is 5 % heavier than in the model, or carries a payload of half a
+            kilogram.
+        gain: gain K of the observer [1/s].
 
     Attributes:
-        threshold: as above, shape (n_joints,) [N m].
-        residual: the estimated external torques r, shape (n_joints,) [N m].
+        threshold: external torque of each joint that counts as a contact, shape (n_joints,) [N m].
+        residual: estimated external torques r, shape (n_joints,) [N m].
 
     Raises:
         InputError: when a number can't be used, or a link of the arm has no usable mass.
@@ -96,14 +99,14 @@ class ContactDetector:
         self.residual: Array = np.zeros(self.arm.n_joints)
 
     def update(self, state: ArmState) -> Contact | None:
-        """Take the next measured state, and return the contact that it shows.
+        """Update the estimate with the next measured state, and return a contact if one is detected.
 
         Args:
             state: positions, velocities and drive torques of the joints. If all torques are exactly 0, they count as
                 not measured.
 
         Returns:
-            None when no external torque exceeds its threshold.
+            The contact; None when no external torque exceeds its threshold.
         """
         last, self._last = self._last, state
         dt = 0.0 if last is None else state.time - last.time

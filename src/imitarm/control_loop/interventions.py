@@ -1,4 +1,4 @@
-"""The record of what the safety filter changed during a motion."""
+"""Records how the safety filter changed commands during a motion."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from imitarm.safety import SafetyStep
 
 @dataclass(frozen=True)
 class Intervention:
-    """All control steps in which the safety filter changed the command because of the same two parts.
+    """All control steps in which the safety filter changed the command to keep the same two parts apart.
 
     Attributes:
         link: name of the part of the arm.
         other: name of the obstacle, or of another link.
-        count: number of steps.
-        first: time of the first one [s].
-        last: time of the last one [s].
-        room: smallest distance minus the required clearance in these steps [m].
+        count: number of these steps.
+        first: time of the first of these steps [s].
+        last: time of the last of these steps [s].
+        room: smallest difference between distance and required clearance in these steps [m]; negative when too close.
         unsafe: number of these steps in which no safe motion existed.
     """
 
@@ -53,11 +53,11 @@ class InterventionLog:
         )
 
     def result(self) -> tuple[Intervention, ...]:
-        """Return the interventions, those of most steps first."""
+        """Return the interventions, sorted by their number of steps, the largest first."""
         return tuple(sorted(self._found.values(), key=lambda found: -found.count))
 
     def sentence(self) -> str:
-        """Return what the filter did in one sentence; empty if it did nothing."""
+        """Return one sentence about what the filter did; empty if the filter did nothing."""
         found = self.result()
         if not found:
             return ""

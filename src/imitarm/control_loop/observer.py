@@ -1,7 +1,7 @@
-"""What a camera with a tracker knows of a moving scene: noisy, late, and with gaps.
+"""Simulated observation of a moving scene by a camera and a tracker: noisy, late, and with gaps.
 
-:class:`SensorModel` simulates the camera, and :class:`TrackedScene` is the ``observe`` of
-:func:`~imitarm.control_loop.reproduce`: a tracker turns the detections into a scene.
+:class:`SensorModel` simulates the camera, and :class:`TrackedScene` converts its detections to a scene by a tracker. A
+:class:`TrackedScene` can be the argument ``observe`` of :func:`~imitarm.control_loop.reproduce`.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ _ROUNDING = 1e-9  # [s] a frame that arrives so much later than now has arrived
 
 
 class Frame(NamedTuple):
-    """What the sensor has seen at one instant.
+    """The obstacles that the sensor measured at one instant.
 
     Attributes:
         stamp: time of the measurement [s].
-        arrival: time at which it is available [s]; ``stamp`` plus the latency.
+        arrival: time at which the measurement is available [s]; ``stamp`` plus the latency.
         detections: the visible obstacles, in random order and without names.
     """
 
@@ -49,8 +49,9 @@ class Frame(NamedTuple):
 class SensorModel:
     r"""A sensor that measures the positions of obstacles with errors, at a fixed rate, and reports them late.
 
-    Frame ``k`` is measured at ``t_k = k / rate`` and arrives at ``t_k + latency``. In each frame, every obstacle within
-    ``reach`` of the arm's base is missed with the probability ``dropout``. The measured position of the others is
+    Frame ``k`` is measured at ``t_k = k / rate`` and arrives at ``t_k + latency``. Obstacles farther than ``reach``
+    from the arm's base are never detected. In each frame, each of the other obstacles is missed with the probability
+    ``dropout``. If the true position is :math:`p(t_k)`, the measured position of a detected obstacle is
 
     .. math:: z = p(t_k) + \epsilon, \qquad \epsilon \sim N(0, \sigma^2 I)
 
@@ -58,11 +59,11 @@ class SensorModel:
     which lasts 0.5 s, an obstacle is missed in all frames. Every obstacle has one occlusion in each interval of ``1 /
     occlusions`` seconds, at a random time.
 
-    All random numbers follow from the seed, the frame and the obstacle's index. The same frame is therefore the same
-    whenever and however often it is requested.
+    All random numbers follow from the seed, the frame's number k and the obstacle's index. Repeated requests for one
+    frame therefore return the same measurements.
 
     Attributes:
-        noise: sigma, the standard deviation in each direction [m].
+        noise: sigma, the standard deviation of the measured position along each axis [m].
         rate: frames per second [Hz].
         latency: delay of each frame [s].
         dropout: probability from 0 to below 1 that an obstacle is missed in a frame.
@@ -143,33 +144,32 @@ def _anonymous(obstacle: Obstacle) -> Obstacle:
 
 
 class Tracker(Protocol):
-    """What :class:`TrackedScene` needs of an :class:`~imitarm.perception.ObstacleTracker`."""
+    """The methods of an :class:`~imitarm.perception.ObstacleTracker` that :class:`TrackedScene` uses."""
 
     def update(self, stamp: float, detections: Sequence[Detection], /) -> object:
-        """Take the detections of one frame."""
+        """Update the tracks with the detections of one frame."""
 
     def scene(self, time: float, *, goal: Pose | None = None, fixtures: Sequence[Obstacle] = ()) -> Scene:
-        """Return the scene at ``time``, predicted from the frames so far."""
+        """Return the scene at ``time``, predicted from all frames received so far."""
 
     def reset(self) -> None:
-        """Forget everything."""
+        """Delete all tracks."""
 
 
 class TrackedScene:
-    """The scene as a tracker knows it, from the frames that have arrived; callable as ``observe(t)``.
+    """Tracks a scene from the frames that have arrived; call it as ``observe(t)``.
 
-    The sensor watches for ``lead`` seconds before time 0, as a camera that is on before the arm moves.
-
-    ``observe(t)`` depends on ``t`` only, not on the calls before: when ``t`` is earlier than in the last call, the
+    The sensor starts ``lead`` seconds before time 0, like a camera that is switched on before the arm moves. The result
+    of ``observe(t)`` depends only on ``t``, not on previous calls. If ``t`` is earlier than in the last call, the
     tracker is reset and all frames are replayed.
 
     Args:
         truth: the true obstacles over time.
-        sensor: the sensor.
-        tracker: an :class:`~imitarm.perception.ObstacleTracker`, or an object with the same three methods.
-        goal: goal of the scenes that are returned.
-        fixtures: fixtures of the scenes that are returned.
-        lead: how long before time 0 the sensor begins [s].
+        sensor: simulated sensor that measures these obstacles.
+        tracker: :class:`~imitarm.perception.ObstacleTracker`, or an object with the methods of :class:`Tracker`.
+        goal: goal of the returned scenes.
+        fixtures: fixtures (known obstacles that do not move) of the returned scenes.
+        lead: time between the start of the sensor and time 0 [s].
 
     Raises:
         InputError: when an argument has the wrong type, or ``lead`` is negative.

@@ -1,4 +1,4 @@
-"""PersonObserver: the arms of a person as obstacles of a control loop, and several observers as one."""
+"""PersonObserver: a person's arms as obstacles of a control loop. CombinedObserver: several observers as one."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from imitarm.scene import Scene
 from imitarm.validation import finite_number, function, instance
 
 PERSON_NOISE = 2.0
-"""Process noise of a tracker of arms [m^2/s^3]: hands accelerate more than things. With this value, every arm keeps its
-track in the Kinect recordings of gestures."""
+"""Process noise of a tracker for a person's arms [m^2/s^3]. The value is larger than for objects, because hands
+accelerate more. With this value, the tracker loses no arm in the Kinect recordings of gestures."""
 
 _ROUNDING = 1e-9  # [s]
 
 
 class PersonObserver:
-    """The arms of a person as a skeleton camera and a tracker know them; callable as ``observe(t)``.
+    """Observes the arms of a person with a skeleton camera and a tracker; call it as ``observe(t)``.
 
-    A skeleton of the time ``s`` arrives at ``s + latency``. Then its capsules go to the tracker with the stamp ``s``,
-    and ``observe(t)`` returns the tracks predicted to ``t``. If the newest skeleton is older than ``max_age``, the
-    stamp of the scene stays that of the newest skeleton, so that a watchdog can see how old it is.
-
-    Calls must be in the order of time.
+    A skeleton that was measured at time ``s`` arrives at ``s + latency``. Then the tracker is updated with the capsules
+    of the skeleton and the stamp ``s``. ``observe(t)`` returns the tracked capsules, predicted to the time ``t``. If
+    the newest skeleton is older than ``max_age``, the scene keeps the stamp of this skeleton. From this stamp, a
+    watchdog can compute the age of the scene. The time must not decrease from one call to the next.
 
     Args:
         skeletons: skeletons in the order of their times: a :class:`~imitarm.capture.skeleton.SkeletonSource` or any
-            other iterable. It is read until a skeleton has not yet arrived.
-        capsules: turns skeletons into detections.
-        tracker: an :class:`~imitarm.perception.ObstacleTracker` of its own; None: one with :data:`PERSON_NOISE`.
+            other iterable. Each call reads up to the first skeleton that has not yet arrived.
+        capsules: object that converts skeletons to detected capsules.
+        tracker: :class:`~imitarm.perception.ObstacleTracker` that no other observer uses; None: a new tracker with
+            :data:`PERSON_NOISE`.
         latency: time from the exposure to the arrival of a skeleton [s].
         max_age: age of the newest skeleton at which the camera counts as frozen [s].
-        start: time of the call at which the first skeleton was exposed [s]; None: the times of the skeletons are on the
-            clock of the calls.
+        start: time on the clock of the calls at which the first skeleton was measured [s]; None: the skeletons' times
+            are already on the clock of the calls.
 
     Attributes:
         n_skeletons: number of skeletons that were used.
@@ -94,14 +94,14 @@ class PersonObserver:
 
 
 class CombinedObserver:
-    """Several observers as one, for example a depth camera for things and a skeleton camera for people.
+    """Combines several observers, for example a depth camera for objects and a skeleton camera for people.
 
-    The scene contains the obstacles of all observers. Its stamp is the oldest of theirs, so that one frozen camera is
-    enough to be seen. Track numbers are made distinct: the tracks of observer ``i`` of ``n`` get the numbers
-    ``n * id + i``.
+    The scene contains the obstacles of all observers. The stamp of the scene is the oldest stamp of all observers, so
+    that a watchdog notices even a single frozen camera. Each track gets a unique number: track ``id`` of observer ``i``
+    of ``n`` becomes ``n * id + i``.
 
     Args:
-        observers: functions ``observe(t)``; goal and fixtures are those of the first.
+        observers: functions ``observe(t)``; the first function determines the goal and the fixtures of the scene.
 
     Raises:
         InputError: when there is no observer, or one is not a function.

@@ -36,7 +36,7 @@ class Step:
         tool_to_base: measured pose of the tool after the step.
         state: measured state of the arm after the step.
         scene: the observed scene.
-        command: the policy's command, or what the watchdog left of it.
+        command: the policy's command, possibly slowed down by the watchdog.
         safety: result of the safety filter for this command.
         clearance: measured distance from arm and tool to the nearest obstacle [m].
     """
@@ -66,14 +66,14 @@ def reproduce(
 
     In every control period ``dt``, ``observe`` returns the scene, and the policy returns a
     :class:`~imitarm.command.Command`. The :class:`~imitarm.safety.SafetyFilter` converts the command to joint
-    velocities that keep the arm's limits and clearances, and the robot moves. A new opening in the command moves the
-    fingers of the gripper. The motion ends when the policy has finished, when the robot has stopped to protect itself,
-    when the torques of the joints show a contact, or at ``timeout``. The robot is always braked to a stop, also after
-    an exception.
+    velocities that keep the arm's limits and clearances, and the robot moves. If the command contains a new gripper
+    opening, the gripper moves its fingers. The motion ends when the policy has finished, when the robot has stopped to
+    protect itself, when the torques of the joints show a contact, or at ``timeout``. The robot is always braked to a
+    stop, also after an exception.
 
     Args:
         policy: policy that decides the motion; its ``reset`` is called first.
-        robot: what moves.
+        robot: robot that executes the motion.
         observe: function that takes the time since the start [s] and returns the latest known scene. The scene may have
             been measured earlier; its ``stamp`` is the time of that measurement [s].
         dt: control period [s]; for a simulated robot, it must be a multiple of the simulation's timestep.
@@ -90,15 +90,15 @@ def reproduce(
 
     Returns:
         The measured motion from rest to rest. Its attribute ``success`` means that the motion finished in time, touched
-        nothing, and kept the clearance that the filter requires. Its ``details`` contain the commanded ``"twists"``
-        (n, 6) and several counts. The count ``"clamped"`` says how often each limit changed a command. The count
+        nothing, and kept the clearance that the filter requires. Its ``details`` contain the commanded ``"twists"`` (n,
+        6) and several counts. The count ``"clamped"`` says how often each limit changed a command. The count
         ``"filtered"`` is the number of steps in which the filter changed a command to keep a clearance, and
         ``"unsafe"`` is the number of steps without a safe motion. ``"interventions"`` is a tuple of
-        :class:`~imitarm.control_loop.interventions.Intervention`, with the names of the parts that came near each
-        other, and ``"contact"`` the detected :class:`~imitarm.control_loop.contact.Contact` or None. The count
-        ``"statuses"`` is the number of steps with each status of the policy. The details also contain the entries of
-        the robot's :meth:`~imitarm.robots.robot.Robot.report`. The attribute ``reason`` names contacts and what the
-        safety filter did.
+        :class:`~imitarm.control_loop.interventions.Intervention`, which name the parts that came close to each other.
+        ``"contact"`` is the detected :class:`~imitarm.control_loop.contact.Contact`, or None. The count ``"statuses"``
+        is the number of steps with each status of the policy. The details also contain the entries of the robot's
+        :meth:`~imitarm.robots.robot.Robot.report`. The attribute ``reason`` names contacts and what the safety filter
+        did.
 
     Raises:
         InputError: when ``dt`` or ``timeout`` is not positive, or the policy does not return a Command.
@@ -111,7 +111,7 @@ def reproduce(
     keeper = SafetyFilter(robot.arm, dt=dt) if safety is None else safety
     if keeper.dt != dt:
         raise InputError(
-            f"reproduce: the safety filter was made for dt {keeper.dt:g} s, not {dt:g} s; make it with the same dt"
+            f"reproduce: the safety filter was made for dt {keeper.dt:g} s, not {dt:g} s; use the same dt for both"
         )
     watch = Watchdog() if watchdog is None else instance(watchdog, Watchdog, "reproduce: watchdog")
     watch.reset()

@@ -1,4 +1,4 @@
-"""Watchdog of the sensor: without new scenes, the arm slows down and then stops."""
+"""Watchdog for the sensor: while no new scenes arrive, the arm slows down and then stops."""
 
 from __future__ import annotations
 
@@ -13,19 +13,21 @@ from imitarm.validation import finite_number, flag
 class Watchdog:
     r"""Slows the arm down and stops it while the sensor is frozen or silent.
 
-    The ``stamp`` of a scene is the time at which it was seen. If no scene with a later stamp has arrived for the time
-    a, the command is multiplied by
+    The ``stamp`` of a scene is the time at which the scene was measured. Let a be the time since a scene with a later
+    stamp than all earlier scenes arrived. The watchdog multiplies the command by
 
     .. math:: f(a) = \min\Big(1,\; \max\Big(0,\; \frac{a_{stop} - a}{a_{stop} - a_{slow}}\Big)\Big) .
 
-    The arm moves again when a scene with a later stamp arrives. A scene whose stamp has never changed counts as a scene
-    in which nothing moves, and does not stop the arm, unless ``from_start`` is set.
+    The arm moves again when a scene with a later stamp arrives. As long as the stamp has never changed, the scene
+    counts as static, and the watchdog does not stop the arm. If ``from_start`` is set, the watchdog also stops the arm
+    in this case.
 
     Args:
         slow_after: a_slow, age of the newest scene at which the arm begins to slow down [s]. Choose at least twice the
             time between two scenes.
-        stop_after: a_stop, age at which it stands [s].
-        from_start: whether new scenes are expected from the beginning.
+        stop_after: a_stop, age of the newest scene at which the arm has stopped [s].
+        from_start: whether new scenes are expected from the start, so that the arm also stops if the first scene stays
+            the only one.
 
     Raises:
         InputError: when the times are not positive, or ``stop_after`` is not later than ``slow_after``.

@@ -1,11 +1,11 @@
-"""Align demonstrations: cut off rest at both ends, and warp time so that all motions pass matching points together.
+"""Align demonstrations: cut off rest at both ends, and warp time so that all motions pass a matching point at once.
 
 People never repeat a motion at exactly the same speed. A bend may therefore occur early in one demonstration and late
 in another. The mean of the demonstrations at equal times would smear a bend, because averaging cuts corners and
 flattens peaks. Alignment changes the time at which a demonstration reaches each point of its path, but never the path.
 
-Dynamic time warping within a band finds the matching points. For two motions ``a``, ``b`` of n samples, the cheapest
-monotone path through the grid of costs ``c(i, j) = |a_i - b_j|^2`` follows from a recursion:
+Dynamic time warping (DTW) within a band finds the matching points. For two motions ``a``, ``b`` of n samples, the
+cheapest monotone path through the grid of costs ``c(i, j) = |a_i - b_j|^2`` follows from a recursion:
 
     D(i, j) = c(i, j) + min(D(i-1, j-1) + c(i, j), D(i-1, j) + p, D(i, j-1) + p)
 
@@ -66,12 +66,12 @@ class Alignment:
         demonstrations: demonstrations with common times from 0 to ``duration``.
         duration: common duration of the aligned demonstrations, the median of the trimmed demonstrations' durations
             [s].
-        kept_rows: the first and the last of the rows that were kept of each demonstration, shape
+        kept_rows: index of the first and of the last row that trimming kept of each demonstration, shape
             (n_demonstrations, 2).
         durations: duration of each trimmed demonstration before alignment [s], shape (n_demonstrations,).
-        warps: for each sample of an aligned demonstration, the time of the same point in the trimmed demonstration.
-            This time is a fraction of the trimmed demonstration's duration, from 0 to 1, strictly increasing, shape
-            (n_demonstrations, n).
+        warps: for each sample of an aligned demonstration, the time of the same point in the trimmed demonstration,
+            shape (n_demonstrations, n). Each time is a fraction of the trimmed demonstration's duration, from 0 to 1.
+            The times strictly increase.
         method: ``"dtw"`` or ``"resample"``.
     """
 
@@ -91,7 +91,7 @@ class Alignment:
     def notes(self) -> list[str]:
         """Return a description of how alignment changed each demonstration, one line for each."""
         return [
-            f"{one.source}: {duration:.2f} s to {self.duration:.2f} s, largest time shift {shift:.2f} s"
+            f"{one.source}: duration {duration:.2f} s, now {self.duration:.2f} s; largest time shift {shift:.2f} s"
             for one, duration, shift in zip(self.demonstrations, self.durations, self.largest_shift, strict=True)
         ]
 
@@ -195,7 +195,7 @@ def noise_level(values: Array) -> float:
 
 
 def turns(quaternions: Array) -> Array:
-    """Return the accumulated rotation (n, 3) [rad]: the sum of the rotation vectors of all steps so far."""
+    """Return for each sample the sum of the rotation vectors of all steps up to this sample, shape (n, 3) [rad]."""
     q = continuous_signs(quaternions)
     steps = quaternion_log(quaternion_multiply(q[1:], quaternion_conjugate(q[:-1])))
     return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
@@ -249,7 +249,7 @@ def _moving(times: Array, values: Array, still: float) -> tuple[int, int] | None
 
 
 def held_rows(values: Array) -> NDArray[np.bool_]:
-    """Return whether each row of a recorded quantity (n, d) only repeats the previous row, shape (n,) bool."""
+    """Return whether each row of recorded ``values`` (n, d) repeats the previous row by sample and hold, shape (n,)."""
     none = np.zeros(len(values), dtype=bool)
     steps = np.abs(np.diff(values, axis=0))
     same = np.asarray(~(steps > 0.0).any(axis=1))
@@ -357,16 +357,17 @@ def _trace(total: Array, cost: Array, price: float) -> Indices:
 
 
 def identity_warps(n_demonstrations: int, n: int) -> Array:
-    """Return warps that change nothing, shape (n_demonstrations, n)."""
+    """Return the warps of unchanged motions: evenly spaced times from 0 to 1, shape (n_demonstrations, n)."""
     return np.tile(np.linspace(0.0, 1.0, n), (n_demonstrations, 1))
 
 
 def features(trajectories: Sequence[Trajectory]) -> Array:
-    """Return the features by which motions are compared [m]: shape (n_demonstrations, n, 3); with rotations (..., 6).
+    """Return the features by which motions are compared [m].
 
     Each path is first moved to the common start and goal, because a different start position does not mean that the
-    motion started earlier or later. Rotations are expressed as rotation vectors relative to the mean rotation,
-    multiplied by a lever arm of 0.1 m.
+    motion started earlier or later. Rotations become rotation vectors relative to the mean rotation, multiplied by a
+    lever arm of 0.1 m. The features have the shape (n_demonstrations, n, 3), or (n_demonstrations, n, 6) with
+    rotations.
     """
     parts = [to_common_ends(np.stack([trajectory.positions for trajectory in trajectories]))]
     if trajectories[0].quaternions is not None:
@@ -382,7 +383,7 @@ def rotation_paths(trajectories: Sequence[Trajectory]) -> Array:
 
 
 def to_common_ends(values: Array) -> Array:
-    """Return the motions (m, n, d), moved so that all begin at the mean start and end at the mean goal."""
+    """Return the m motions (m, n, d), moved so that they all begin at the mean start and end at the mean goal."""
     fraction = np.linspace(0.0, 1.0, values.shape[1])[:, None]
     start, goal = values[:, :1], values[:, -1:]
     return np.asarray(values - (1.0 - fraction) * (start - start.mean(axis=0)) - fraction * (goal - goal.mean(axis=0)))
@@ -401,9 +402,9 @@ def barycentre_warps(values: Array, *, band: float = 0.2, stiffness: float = 1.0
 
     The first barycentre is the medoid: the motion nearest to all others. Each round matches every motion with the
     barycentre by :func:`dtw` and smooths the matched times into a warp. The mean of the warped motions is the
-    barycentre of the next round. The averaging is that of Petitjean et al. 2011, except that each motion has one smooth
-    warp in place of sets of matched samples. The warps are centred, which means that their mean is the identity.
-    Therefore the common speed profile is the mean of all speed profiles, not the profile of the medoid.
+    barycentre of the next round. Petitjean et al. (2011) average in the same way, but with sets of matched samples in
+    place of a smooth warp for each motion. The warps are centred: their mean changes no time. Therefore the common
+    speed profile is the mean of all speed profiles, not the profile of the medoid.
 
     Args:
         values: features, shape (n_demonstrations, n, d), evenly spaced in time.
@@ -412,7 +413,7 @@ def barycentre_warps(values: Array, *, band: float = 0.2, stiffness: float = 1.0
         n_iterations: largest number of rounds; the rounds end earlier when the warps no longer change.
 
     Returns:
-        shape (n_demonstrations, n), from 0 to 1, strictly increasing.
+        Time warps, shape (n_demonstrations, n); each row strictly increases from 0 to 1.
     """
     m, n, _ = values.shape
     even = np.linspace(0.0, 1.0, n)

@@ -26,7 +26,7 @@ _FIELDS = ("times", "positions", "quaternions", "joints")
 
 
 class NumpyReader(Reader):
-    """Arrays of numbers.
+    """Reads arrays of numbers.
 
     An array of shape (n, columns) is one motion of n samples. An array of shape (n_demonstrations, n, columns) is
     several motions. The columns have the same meaning as in a text table without column names. An .npz file with an

@@ -1,6 +1,6 @@
 """Find out what each column of a table holds, from the column names or, without names, from the number of columns.
 
-An unknown unit is an error. A rotation in a form that can't be read, such as Euler angles, is reported.
+An unknown unit is an error. A rotation that can't be read, such as Euler angles, is reported and left out.
 """
 
 from __future__ import annotations
@@ -121,10 +121,10 @@ class Column:
     """The meaning of one column name.
 
     Attributes:
-        what: quantity in the column: ``t``, ``x``, ``y``, ``z``, ``qw`` to ``qz`` or ``joint``; empty if the name is
-            unknown.
+        what: quantity in the column: time ``t``, position ``x``, ``y``, ``z``, quaternion ``qw`` to ``qz``, or
+            ``joint``; empty if the name is unknown.
         unit: unit that the column name states, in lower case; None if the name states no unit.
-        joint: name of the joint, without words such as ``position.``.
+        joint: name of the joint, without prefixes such as ``position.``.
         not_angle: what the column of a joint holds if it does not hold joint angles, for example ``"velocities"``.
     """
 
@@ -188,7 +188,7 @@ def named_columns(
         names: name of each column; joints are recognised by names such as ``right_j0`` or ``panda_joint1``.
         values: numbers in the columns, shape (n, len(names)).
         options: options for facts that the file does not state, such as units.
-        said: units that the file states outside its column names.
+        said: units that the file states in its remarks, not in its column names.
 
     Raises:
         FileFormatError: when a unit is unknown, a quantity or a joint is given twice, or there is neither a position

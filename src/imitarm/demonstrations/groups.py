@@ -1,6 +1,7 @@
-"""Groups: find demonstrations that take different paths between the same ends.
+"""Groups: find demonstrations that take different paths from the same start to the same goal.
 
-Two ways around an obstacle have no useful mean. Each group of demonstrations needs a skill of its own.
+The mean of two paths around an obstacle may lead through the obstacle. Each group of demonstrations therefore needs a
+skill of its own.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ _COMPACT_RATIO = 5.0  # likewise for groups that are compact
 def group_by_path(demonstrations: Sequence[Demonstration]) -> list[list[Demonstration]]:
     """Divide demonstrations of one task into groups that take the same path, so that a skill can be learned from each.
 
-    Two demonstrations belong to different groups if their aligned paths, moved to common ends, are more than 20 % of
-    the motion's size apart. For groups of at least 3 demonstrations, 5 % are sufficient if the gap between the groups
-    is at least 5 times as large as the gaps within them.
+    The paths are aligned, and moved to a common start and goal. Two demonstrations belong to different groups if the
+    distance between their paths exceeds 20 % of the motion's size. If each group has at least 3 demonstrations, a
+    distance of 5 % is enough, provided that it is at least 5 times as large as the distances within the groups.
 
     Args:
         demonstrations: demonstrations that run in the same direction between similar ends; see
@@ -71,7 +72,7 @@ def split_paths(distance: Array, size: float) -> tuple[NDArray[np.bool_], float]
         size: size of the motion [m].
 
     Returns:
-        A mask that selects one group, shape (m,), and the gap between the groups [m].
+        A mask that is true for the demonstrations of one group, shape (m,), and the gap between the groups [m].
     """
     found = two_groups(distance, max(LEAST_GAP, _PATHS_APART * size))
     if found is None:
@@ -83,7 +84,7 @@ def split_paths(distance: Array, size: float) -> tuple[NDArray[np.bool_], float]
 
 
 def aligned_paths(trajectories: Sequence[Trajectory]) -> tuple[Array, Array | None]:
-    """Return aligned positions (m, n, 3) and quaternions (m, n, 4), or None if a motion has no quaternions."""
+    """Return aligned positions (m, n, 3) [m] and quaternions (m, n, 4); None instead if a motion has no quaternions."""
     if any(one.quaternions is None for one in trajectories):
         trajectories = [Trajectory(one.times, one.positions) for one in trajectories]
     warps = barycentre_warps(features(trajectories), n_iterations=4)
@@ -110,11 +111,11 @@ def two_groups(
         distance: distances between the demonstrations, shape (m, m).
         floor: smallest gap between groups, in the unit of ``distance``.
         ratio: smallest ratio of the longest edge to the second longest.
-        others_too: whether to ignore ``ratio`` if the second longest edge also exceeds ``floor``; there are then more
-            than two groups.
+        others_too: whether to ignore ``ratio`` if the second longest edge also exceeds ``floor``. In this case, there
+            are more than two groups, and the longest edge separates one from the rest.
 
     Returns:
-        A mask that selects one group, shape (m,), and the gap between the groups.
+        A mask that is true for the demonstrations of one group, shape (m,), and the gap, in the unit of ``distance``.
     """
     m = len(distance)
     nearest, inside, links = distance[0].copy(), np.arange(m) == 0, []

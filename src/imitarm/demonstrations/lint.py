@@ -1,9 +1,9 @@
 """Lint: list the faults of demonstrations before a skill is learned from them.
 
 Each check yields findings. The checks in this module examine each motion by itself, and compare the motions with each
-other. If some demonstrations run backwards, stop early, end elsewhere or take another path, the mean of all
-demonstrations is a motion that nobody demonstrated. Checks of the numbers in a file are in ``raw.py``. Checks of
-units, and of a motion against an arm, are in ``plausibility.py``.
+other. The mean of several demonstrations is useful only if these agree. If some run backwards, stop early, end
+elsewhere or take another path, the mean is a motion that nobody demonstrated. Checks of the numbers in a file are in
+``raw.py``. Checks of units, and of a motion against an arm, are in ``plausibility.py``.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def check_gaps(motion: ValidRows) -> Iterator[Finding]:
         moved = float(np.linalg.norm(motion.positions[longest + 1] - motion.positions[longest]))
         count = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest"
         message = (
-            f"{count} of {steps[longest]:.3g} s (usual step {np.median(steps):.3g} s), in which the tool moved "
+            f"{count} of {steps[longest]:.3g} s (the usual step is {np.median(steps):.3g} s), in which the tool moved "
             f"{1e3 * moved:.0f} mm"
         )
         remedy = "record again, or accept a straight line across the gap"
@@ -146,7 +146,7 @@ def check_idle(motion: ValidRows) -> Iterator[Finding]:
 
 
 def check_jumps(motion: ValidRows) -> Iterator[Finding]:
-    """Find steps that are much faster than the steps around them: lost samples, glitches, jumps of a tracker."""
+    """Find steps that are much faster than their neighbours: lost samples, glitches, jumps of a tracking system."""
     remedy = "record again, or cut the file before or after the jump"
     jumps, size = _jumps(motion.times, motion.positions, _JUMP_DISTANCE)
     if len(jumps):
@@ -225,7 +225,7 @@ def check_durations(motions: Sequence[ValidRows]) -> Iterator[Finding]:
     if durations.max() > _DURATION_RATIO * durations.min():
         slow = int(np.argmax(durations))
         message = f"takes {durations[slow]:.2f} s, but the shortest demonstration takes {durations.min():.2f} s"
-        remedy = "check that both show the whole motion; align makes the durations equal"
+        remedy = "check that both demonstrations show the whole motion; align makes the durations equal"
         yield motions[slow].finding("warning", "durations", message, remedy)
 
 
@@ -244,7 +244,7 @@ def check_plane(motions: Sequence[ValidRows]) -> Iterator[Finding]:
         else:
             message = f"all motions lie within {within} of a straight line that is perpendicular to ({vector})"
         yield Finding(
-            "note", "planar", message, remedy="none needed: the skill keeps the position in that direction constant"
+            "note", "planar", message, remedy="none needed: the skill keeps the position along this normal constant"
         )
 
 
@@ -327,7 +327,7 @@ def _incomplete(paths: Array, size: float, motions: Sequence[ValidRows], scale: 
                 percent = 100.0 * (done if verb == "stops" else 1.0 - done)
                 message = (
                     f"{verb} at {percent:.0f} % of the path of {motions[whole[0]].name}, which is "
-                    f"{scale.factor * apart[i, whole[0]]:.0f} {scale.unit} from the {end} of that path"
+                    f"{scale.factor * apart[i, whole[0]]:.0f} {scale.unit} from the {end} of this path"
                 )
                 yield i, message, "incomplete", "leave out this demonstration, or record the whole motion again"
 
@@ -346,7 +346,7 @@ def _groups(motions: Sequence[ValidRows], positions: Array, rotations: Array | N
             odd = int(np.argmax(apart.sum(axis=1)))
             name, degrees = motions[int(np.argmax(apart[odd]))].name, np.degrees(apart[odd].max())
             message = (
-                f"its rotation differs by up to {degrees:.0f} degrees from the rotation of {name} at the same phase, "
+                f"its rotation differs by up to {degrees:.0f} degrees from {name} at the same fraction of the motion, "
                 "so the mean of both rotations would be meaningless"
             )
             remedy = (
@@ -369,7 +369,7 @@ def _groups(motions: Sequence[ValidRows], positions: Array, rotations: Array | N
             continue  # one among many is an outlier
         groups = f"of {_names(motions, few)} and of {_names(motions, many)}"
         message = f"the {what} {groups} are {factor * gap:.0f} {unit} apart"
-        remedy = "learn a separate skill from each group, because the mean of both is a motion that nobody demonstrated"
+        remedy = "learn a separate skill from each group: the mean of the groups is a motion that nobody demonstrated"
         yield motions[few[0]].finding(severity, code, message, remedy)
 
 

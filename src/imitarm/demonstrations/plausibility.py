@@ -122,7 +122,7 @@ def check_arm(motion: ValidRows, arm: ArmModel) -> Iterator[Finding]:
         yield motion.finding(
             "error",
             "joint-units",
-            f"{arm.joint_names[joint]} is at {q[row, joint]:.4g} rad: these are degrees",
+            f"{arm.joint_names[joint]} is at {q[row, joint]:.4g} rad: this number is in degrees",
             "convert the joints to rad, or put the unit in the names: right_j0 [deg]",
             int(row),
         )

@@ -44,7 +44,7 @@ class Finding:
         severity: ``"error"`` (no good skill can be learned), ``"warning"`` (should be checked) or ``"note"``
             (information).
         code: short name that does not change between versions, such as ``"gap"``.
-        message: description of the fault, with measured values.
+        message: description of the fault or fact, with measured values.
         source: name of the demonstration concerned; empty when the finding concerns all demonstrations.
         row: index of the first sample concerned, from 0; None when the finding concerns the whole motion.
         line: line number of the sample ``row`` in the text file, from 1; None when the file is not text.
@@ -87,7 +87,7 @@ class RawDemonstration:
         joint_names: one name for each column of ``joints``.
         task: name of the task.
         lines: line number of each sample in the text file, from 1, shape (n,); None when the file is not text.
-        notes: remarks of the reader about data that it left out, and about its assumptions.
+        notes: remarks of the reader about its assumptions, and about data of the file that it left out.
         unread_rotation: names of columns that seem to hold a rotation in a form that can't be read, such as Euler
             angles.
         length_unit: unit of the lengths in the file, from which ``positions`` were converted.
@@ -207,7 +207,7 @@ class RawDemonstration:
         return replace(self, positions=positions, quaternions=quaternions, joints=q, joint_names=arm.joint_names)
 
     def not_finite(self) -> NDArray[np.bool_]:
-        """Return for each row whether it holds nan, inf or a number above 1e30, shape (n,)."""
+        """Return for each row whether the row holds nan, inf or a number of magnitude above 1e30, shape (n,)."""
         columns = [self.times[:, None], self.positions, self.quaternions, self.joints]
         table = np.hstack([part for part in columns if part is not None])
         return np.asarray(~(np.abs(table) < _BOUND).all(axis=1))
@@ -219,7 +219,7 @@ class RawDemonstration:
         return np.asarray(np.isfinite(self.times) & (self.times <= before))
 
     def held(self) -> NDArray[np.bool_]:
-        """Return for each row whether it repeats the previous row only because the sensor was slower than the recorder.
+        """Return for each row whether the sensor had no new value yet, so that the row repeats the previous row.
 
         A recorder that runs faster than its sensor repeats each value (sample and hold). A tool at rest also repeats
         values, and so does rounding. Repetitions caused by rest or rounding do not count. Values count as held only if
@@ -314,8 +314,8 @@ def _unit(raw: RawDemonstration, keep: NDArray[np.int64]) -> Array:
 class ValidRows:
     """The valid rows of a raw demonstration.
 
-    A row is valid if its numbers are finite, its time stamp is later than the previous one, and it is not a mere
-    repetition of the previous sample.
+    A row is valid if its numbers are finite, its time stamp is later than the previous time stamp, and it does not
+    merely repeat the previous sample.
 
     Attributes:
         raw: the demonstration.
@@ -377,7 +377,7 @@ class ValidRows:
         return Trajectory(self.times[keep], self.positions[keep], quaternions).from_zero().resample(_SAMPLES)
 
     def finding(self, severity: Severity, code: str, message: str, remedy: str, index: int | None = None) -> Finding:
-        """Return a finding about the valid row number ``index``."""
+        """Return a finding about the valid row ``index`` (counted from 0), or about the whole motion if it is None."""
         return self.raw.finding(severity, code, message, remedy, None if index is None else int(self.rows[index]))
 
 
@@ -442,7 +442,7 @@ def check_notes(raw: RawDemonstration) -> Iterator[Finding]:
         )
         yield raw.finding("warning", "rotation-not-read", message, remedy)
     for note in raw.notes:
-        yield raw.finding("note", "reader", note, "none needed if you can do without these data")
+        yield raw.finding("note", "reader", note, "none needed, unless you need these data")
 
 
 RAW_CHECKS = (check_rows, check_quaternions, check_held, check_notes)

@@ -44,12 +44,12 @@ class ReadOptions:
     """Options for facts that some files do not state, such as units.
 
     Attributes:
-        units: unit of lengths, a key of ``LENGTH_UNITS``; None: as the file says, else m.
-        time_units: unit of time stamps, a key of ``TIME_UNITS``; None: as the file says, else s.
+        units: unit of lengths, a key of ``LENGTH_UNITS``; None: the unit that the file states, else m.
+        time_units: unit of time stamps, a key of ``TIME_UNITS``; None: the unit that the file states, else s.
         duration: duration of the motion [s], for files without time stamps.
         rate: samples per second [Hz], for files without time stamps.
-        quaternion_order: ``"wxyz"`` or ``"xyzw"``, for quaternion columns without names; None: as the file says, else
-            wxyz.
+        quaternion_order: ``"wxyz"`` or ``"xyzw"``, for quaternion columns without names; None: the order that the
+            file states, else wxyz.
         task: name of the task; used if the file does not state a task.
 
     Raises:
@@ -124,7 +124,7 @@ class ReadOptions:
         """
         if None not in (self.quaternion_order, said) and self.quaternion_order != said:
             raise InputError(
-                f"{source}: states the quaternion order {said}, which contradicts "
+                f"{source}: states the quaternion order {said}, but this contradicts "
                 f"quaternion_order={self.quaternion_order!r}; "
                 f"leave out that option"
             )
@@ -135,17 +135,17 @@ def _factor(
     source: str, option: str, asked: str | None, said: str | None, known: dict[str, float], default: str
 ) -> float:
     if said is not None and said not in known:
-        raise FileFormatError(f"{source}: says its unit is {said!r}; known units: {', '.join(known)}")
+        raise FileFormatError(f"{source}: states the unit {said!r}; known units: {', '.join(known)}")
     if asked is not None and said is not None and asked != said:
         raise InputError(
-            f"{source}: says its unit is {said}, which contradicts {option}={asked!r}; leave out that option"
+            f"{source}: states the unit {said}, but this contradicts {option}={asked!r}; leave out the option"
         )
     return known[asked or said or default]
 
 
 @dataclass(frozen=True)
 class SaidUnits:
-    """Units and quaternion order that a file states outside its column names; None if not stated."""
+    """Units and quaternion order that a file states in its remarks; None for each that is not stated."""
 
     length: str | None = None
     time: str | None = None
@@ -260,13 +260,14 @@ def read(
 
     Args:
         paths: a file, a folder, or several of them.
-        units: unit of lengths, ``"m"``, ``"cm"``, ``"mm"``, ``"in"`` or ``"ft"``; None: as the file says, else m.
-        time_units: unit of time stamps, ``"s"``, ``"ms"``, ``"us"``, ``"ns"``, ``"min"`` or ``"h"``; None: as the file
-            says, else s.
-        duration: length of each motion [s], for files without time stamps.
+        units: unit of lengths, ``"m"``, ``"cm"``, ``"mm"``, ``"in"`` or ``"ft"``; None: the unit that the file states,
+            else m.
+        time_units: unit of time stamps, ``"s"``, ``"ms"``, ``"us"``, ``"ns"``, ``"min"`` or ``"h"``; None: the unit
+            that the file states, else s.
+        duration: duration of each motion [s], for files without time stamps.
         rate: samples per second [Hz], for files without time stamps.
-        quaternion_order: ``"wxyz"`` or ``"xyzw"``, for quaternion columns without names; None: as the file says, else
-            wxyz.
+        quaternion_order: ``"wxyz"`` or ``"xyzw"``, for quaternion columns without names; None: the order that the
+            file states, else wxyz.
         arm: arm that was recorded, with its tool; needed for files that contain only joint angles.
         task: name of the task; used if the file does not state a task.
         repair: whether to drop rows with numbers that are not finite, and rows that are not later than the previous

@@ -24,14 +24,14 @@ class DemonstrationRecorder:
     stays intact until the new one is complete.
 
     Args:
-        path: the file to write.
+        path: path of the file to write.
         arm: arm that moves; the poses of its tool and its joint positions are written.
         task: name of the task.
         source: origin of the motion, written into the file.
         replace: whether an existing file may be replaced.
 
     Attributes:
-        path: the file to write.
+        path: path of the file to write.
         n_samples: number of samples written so far.
 
     Raises:
@@ -60,10 +60,10 @@ class DemonstrationRecorder:
         return "\n".join([*(f"# {key}: {value}" for key, value in remarks.items()), ",".join(names), ""])
 
     def write(self, time: float, q: Array) -> None:
-        """Add a sample. A sample that is not later than the previous sample is ignored.
+        """Add a sample, unless its time is not later than the time of the previous sample.
 
         Args:
-            time: [s].
+            time: time of the sample [s].
             q: joint positions, shape (n_joints,) [rad].
 
         Raises:

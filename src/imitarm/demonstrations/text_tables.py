@@ -1,8 +1,9 @@
 """Readers of text tables: imitarm's own CSV, and any other table of numbers.
 
-Column names are read from a separate row or from a remark (a line that starts with ``#`` or ``%``), which may stand
-anywhere in the file. If nothing in the file looks like column names, the meaning of the columns is derived from their
-number. An unknown unit is an error, and so is a remark that looks like column names but can't be understood.
+Column names are read from a row of their own or from a remark, which may be anywhere in the file. A remark is a line
+that starts with ``#`` or ``%``. If nothing in the file looks like column names, the meaning of the columns is derived
+from their number. An unknown unit is an error. A remark that looks like column names but can't be understood is also an
+error.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ _NATIVE_MARK = re.compile(rb"(?:\xef\xbb\xbf)?(?:\s*[#%][^\n]*\n)*?\s*[#%]\s*for
 
 
 class ImitarmReader(Reader):
-    """imitarm's own CSV format: remarks with units and frame; columns t x y z, quaternion and joints."""
+    """Reads imitarm's own CSV format: remarks with units and frame; columns t x y z, quaternion and joints."""
 
     suffixes = (".csv",)
 
@@ -68,10 +69,10 @@ class ImitarmReader(Reader):
 
 
 class TextTableReader(Reader):
-    """Any text table of numbers, separated by comma, semicolon, tab or spaces, with or without column names.
+    """Reads any text table of numbers, separated by comma, semicolon, tab or spaces, with or without column names.
 
-    A remark ``# units: cm`` before the numbers, or a name such as ``x [cm]``, specifies the unit. Recordings of joint
-    angles, such as those of Rethink's ``joint_recorder.py`` (``time,right_j0,...,right_j6``), are tables too.
+    A remark ``# units: cm`` before the numbers, or a column name such as ``x [cm]``, specifies the unit. Recordings of
+    joint angles, such as those of Rethink's ``joint_recorder.py`` (``time,right_j0,...,right_j6``), are tables too.
     """
 
     suffixes = (".csv", ".txt", ".tsv", ".dat")

@@ -20,10 +20,10 @@ CATCH_UP = 5.0  # [1/s] fraction of the remaining error to the commanded positio
 
 
 def execute_within_limits(arm: ArmModel, joints: ArrayLike, dt: float) -> Array:
-    r"""Return how an arm that keeps its limits would move when it follows commanded positions, (n, n_joints) [rad].
+    r"""Return the joint positions of an arm that follows commands but keeps its limits, shape (n, n_joints) [rad].
 
-    In each control period, the velocity of the arm is the commanded velocity plus a correction towards the commanded
-    position (``clip`` is explained below):
+    Let :math:`q^c_k` be the commanded and :math:`q_k` the actual position in control period k. The velocity of the arm
+    is the commanded velocity plus a correction towards the commanded position:
 
     .. math:: \dot q_k = \mathrm{clip}\left((q^c_{k+1} - q^c_k) / dt + 5\,\mathrm{s}^{-1}\,(q^c_k - q_k)\right)
 
@@ -57,7 +57,7 @@ class Execution:
         error_max: largest position error of a joint [rad].
         peak_torque_ratio: largest torque of a drive, relative to the rated torque.
         limited: number of frames in which a limit of the robot changed a command.
-        clearance: smallest distance of the arm to an obstacle [m]; inf without obstacles.
+        clearance: smallest distance between the arm and an obstacle [m]; inf without obstacles.
         touched: names of the obstacles that were touched.
         fault: reason of a protective stop; empty without a protective stop.
         duration: time until the protective stop, or duration of the whole motion [s].
@@ -82,7 +82,7 @@ def execute_on_robot(
     the motion.
 
     Args:
-        run: run of a method.
+        run: retargeting run whose motion the robot executes.
         scene: obstacles, which are solid bodies in the simulation.
         progress: function called with the finished fraction, 0 to 1.
     """

@@ -30,10 +30,10 @@ class Interval:
     Attributes:
         mean: mean over persons, where each person is represented by the mean of the person's recordings.
         low: lower end of the interval; nan with fewer than two persons.
-        high: upper end.
+        high: upper end of the interval; nan with fewer than two persons.
         persons: number of persons.
-        used: number of recordings with a value.
-        of: all recordings.
+        used: number of recordings that have a value.
+        of: number of all recordings.
     """
 
     mean: float
@@ -81,10 +81,10 @@ def interval(values: Values, *, confidence: float = 0.95, seed: int = 0) -> Inte
 def bootstrap(samples: ArrayLike, *, confidence: float = 0.95, seed: int = 0) -> tuple[float, float]:
     r"""Return the percentile bootstrap interval of a mean.
 
-    Resampled means of n samples scatter too little: their standard deviation is too small by the factor
-    :math:`\sqrt{(n-1)/n}`. Therefore the deviation of each resampled mean from the sample mean is divided by
-    :math:`\sqrt{(n-1)/n}`. Without this division, a "95 %" interval of ten samples would contain the true mean in only
-    90 % of all cases.
+    The means of resampled data vary too little: with n samples, their standard deviation is too small by the factor
+    :math:`\sqrt{(n-1)/n}`. Therefore the difference between each resampled mean and the sample mean is divided by this
+    factor. Without this division, a "95 %" interval of ten samples would contain the true mean in only 90 % of all
+    cases.
 
     Args:
         samples: shape (n,).
@@ -107,13 +107,13 @@ def bootstrap(samples: ArrayLike, *, confidence: float = 0.95, seed: int = 0) ->
 def block_bootstrap(
     values: ArrayLike, times: ArrayLike, block: float, *, confidence: float = 0.95, seed: int = 0
 ) -> tuple[float, float]:
-    """Return the bootstrap interval of the mean of a time series whose neighbouring values are correlated.
+    """Return the bootstrap interval of the mean of a time series in which successive values are correlated.
 
     The series is cut into blocks of equal duration, and whole blocks are resampled, so that the correlation inside a
-    block is kept. The blocks should be several times as long as the correlation lasts.
+    block is kept. A block should be several times as long as the time over which values are correlated.
 
     Args:
-        values: shape (n,).
+        values: values of the time series, shape (n,).
         times: time of each value, shape (n,) [s].
         block: duration of a block [s].
         confidence: confidence level of the interval.
@@ -145,8 +145,8 @@ def median_ratio(
     The cases are resampled, so that the two values of a case stay together.
 
     Args:
-        ours: shape (n,).
-        theirs: values for the same cases, shape (n,); positive.
+        ours: values of the first measure, one for each case, shape (n,).
+        theirs: positive values of the second measure for the same cases, shape (n,).
         confidence: confidence level of the interval.
         seed: seed of the resampling.
 
@@ -202,19 +202,19 @@ def compare(ours: Values, theirs: Values) -> Comparison:
 def rate_interval(outcomes: Values) -> Interval:
     r"""Return the success rate, averaged over persons, with its 95 % interval.
 
-    For N trials, the interval is the Wilson interval for :math:`N / D` trials, because the trials of one person are
-    similar (Rao and Scott, Biometrics 1992). :math:`D = 1 + (m - 1) \rho` is the design effect of m trials per person.
-    :math:`\rho` is the correlation between trials of one person. The correlation is estimated from the variance of the
-    persons' success rates, compared with the variance that chance alone would cause. The estimate from a few persons is
-    poor, so it is averaged with a prior correlation of 0.3, which has the weight of two persons. If all trials had the
-    same result, or if there is only one person, the correlation is set to 0.3. :math:`N / D` lies between the number of
-    persons and N.
+    The trials of one person are similar. Therefore N trials count only as :math:`N / D` independent trials, for which
+    the Wilson interval is computed (Rao and Scott, Biometrics 1992). :math:`D = 1 + (m - 1) \rho` is the design effect
+    of m trials per person. :math:`\rho` is the correlation between trials of one person. The correlation is estimated
+    from the variance of the persons' success rates, compared with the variance that chance alone would cause. An
+    estimate from a few persons is inaccurate. It is therefore averaged with a prior correlation of 0.3, which has the
+    weight of two persons. If all trials had the same result, or if there is only one person, the correlation is set to
+    0.3. :math:`N / D` lies between the number of persons and N.
 
-    One more failure can make the computed interval narrower: if only one person fails, the persons seem to differ; if a
-    second person fails as well, the persons seem to be alike. To prevent such narrowing, the function also considers
-    every result that is at least as good as ``outcomes`` in each trial, and returns the lowest of the lower ends. In
-    the same way, it considers every result that is at least as bad as ``outcomes`` in each trial, and returns the
-    highest of the upper ends.
+    With this rule alone, one more failure could make the interval narrower: if only one person fails, the persons seem
+    to differ; if a second person fails as well, they seem to be alike. To prevent this effect, the function also
+    computes the interval of every result that is at least as good as ``outcomes`` in each trial, and returns the lowest
+    of the lower ends. In the same way, it considers every result that is at least as bad as ``outcomes`` in each trial,
+    and returns the highest of the upper ends.
 
     Args:
         outcomes: outcome of each trial, 1 for success, 0 for failure.
@@ -276,7 +276,7 @@ def wilson_interval(successes: float, trials: float, z: float = 1.959964) -> tup
     Args:
         successes: number of successes, 0 to ``trials``; both numbers may be fractional.
         trials: number of trials, at least 1.
-        z: normal quantile of the confidence level.
+        z: quantile of the standard normal distribution for the confidence level; 1.96 for 95 %.
     """
     p = min(max(successes / trials, 0.0), 1.0)
     centre = p + z * z / (2 * trials)
@@ -293,7 +293,7 @@ def sign_flip_p(differences: ArrayLike, *, seed: int = 0) -> float:
     differences, the p-value can't be less than 2 / 2^n.
 
     Args:
-        differences: one per person, shape (n,).
+        differences: mean difference of each person, shape (n,).
         seed: seed of the random sign flips, which are used for more than 14 differences.
 
     Returns:
@@ -313,7 +313,7 @@ def sign_flip_p(differences: ArrayLike, *, seed: int = 0) -> float:
 
 
 def holm(p: Sequence[float]) -> list[float]:
-    """Return p-values corrected for multiple comparisons (Holm 1979), in the order of the arguments."""
+    """Return the p-values ``p`` after correction for multiple comparisons (Holm 1979), in the same order."""
     order = sorted(range(len(p)), key=lambda i: p[i])
     corrected, largest = [0.0] * len(p), 0.0
     for rank, i in enumerate(order):

@@ -39,27 +39,29 @@ _REST = 0.5  # [s] at the end: the last target is averaged over it
 
 @dataclass(frozen=True)
 class MappingMetrics:
-    """The measures of a retargeting. Unknown values are nan.
+    """The measures of a retargeting run. Unknown values are nan.
 
-    Errors of tool and elbow are relative to a reference: the motion that results when the clutch law is applied to the
-    person's *true* hand, from the start of the engagement. Each engagement has a new reference. Errors are averaged
-    over the engaged frames (states following, coasting and holding), so compare them together with
-    ``engaged_fraction``. Only ``tool_rms_from_first`` includes all frames after the first engagement.
+    An *engagement* is a period in which the robot is in one of the states "following", "coasting" and "holding";
+    docs/retargeting.md describes these states. Errors of tool and elbow are relative to a reference: the clutch law,
+    applied to the person's *true* hand from the start of the engagement. The clutch law moves the tool by the scaled
+    displacement of the hand. Each engagement has a new reference. Errors are averaged over the engaged frames only, so
+    compare them together with ``engaged_fraction``. Only ``tool_rms_from_first`` includes all frames after the first
+    engagement.
 
     Attributes:
         duration: duration of the robot's motion [s].
         following_fraction: fraction of the frames with state "following".
         engaged_fraction: fraction of the frames that are engaged: with state "following", "coasting" or "holding".
         engagements: how often the robot began to follow the person.
-        tool_rms: root mean square distance of the tool to the reference, including the lag [m].
+        tool_rms: root mean square distance between the tool and the reference, including the lag [m].
         tool_rms_without_lag: ``tool_rms`` after removing the constant lag that gives the smallest value [m].
         lag: the constant lag that is removed in ``tool_rms_without_lag`` [s].
-        tool_rms_from_first: root mean square distance of the tool to the reference of the first engagement, over all
-            later frames in any state, including the lag [m].
+        tool_rms_from_first: root mean square distance between the tool and the reference of the first engagement,
+            including the lag [m]; the mean is taken over all later frames, in any state.
         executed_rms: ``tool_rms`` of an arm that executes the commands within its limits of position, velocity and
-            acceleration [m]. Commands beyond the limits therefore give no advantage.
+            acceleration [m]. A method therefore gains nothing from commands beyond the limits.
         executed_rms_without_lag: ``executed_rms`` after removing the constant lag that gives the smallest value [m].
-        target_rms: root mean square distance of the tool to the method's own target [m].
+        target_rms: root mean square distance between the tool and the target that the method computed [m].
         orientation_rms: root mean square angle between the tool's rotation and the reference [rad].
         elbow_direction_rms: root mean square angle between the actual and the correct direction of the robot's upper
             arm, see :func:`~imitarm.evaluation.tracking.elbow_direction_errors` [rad].
@@ -75,18 +77,19 @@ class MappingMetrics:
             subtracted [N m].
         effort: integral over time of the squared torques, summed over the joints [N^2 m^2 s].
         gravity_effort: like ``effort``, but only for the torques that hold the arm against gravity [N^2 m^2 s].
-        peak_torque_ratio: largest torque relative to the rated torque.
+        peak_torque_ratio: largest torque of a joint, divided by the joint's rated torque.
         position_violations: number of frames in which a joint is outside its range.
         velocity_violations: number of frames in which a joint exceeds its velocity limit, by finite differences of the
             positions.
         acceleration_violations: number of frames in which a joint exceeds its acceleration limit, by finite differences
             of the positions.
         position_excess: largest distance of a joint from its range [rad].
-        velocity_ratio: largest velocity relative to its limit.
-        acceleration_ratio: largest acceleration relative to its limit.
+        velocity_ratio: largest velocity of a joint, divided by the joint's limit.
+        acceleration_ratio: largest acceleration of a joint, divided by the joint's limit.
         jerk_rms: RMS jerk of the tool's position [m/s^3].
         joint_jerk_rms: RMS jerk of all joints together [rad/s^3].
-        spectral_arc_length: spectral arc length of the tool's speed, a measure of smoothness; 0 is smoothest.
+        spectral_arc_length: spectral arc length of the tool's speed, a measure of smoothness; the closer to 0, the
+            smoother.
         least_singular: smallest singular value of the tool's Jacobian during the motion, with 1 rad counted as 0.3
             m [m/rad].
         teaching_time: time that a teacher needs for the corrections of the method [s]; 0 for methods without a teacher.
@@ -137,14 +140,14 @@ class MappingMetrics:
 
 
 def measure(run: Retargeting, correspondence: Correspondence, true: TrueArm | None = None) -> MappingMetrics:
-    """Measure a retargeting.
+    """Measure a retargeting run.
 
     Args:
-        run: run of the method.
-        correspondence: correspondence between person and robot, the input of the method.
+        run: run of a retargeting method.
+        correspondence: arm, scale, orientation and sensor pose by which the method related the person to the robot.
         true: the person's true arm, one sample for each time of the run. If the method slows the motion down, the
             robot reproduces what the person did at an earlier time, and the sample shows the arm at this earlier time.
-            None if the true arm is unknown, as with a real camera; measures that need the true arm are then nan.
+            None: the true arm is unknown, for example with a real camera, and the measures that need it are nan.
 
     Raises:
         InputError: when the run is shorter than 4 control periods or a joint position is not finite.

@@ -22,7 +22,7 @@ _ROUNDED = 1e-9  # [rad] tolerance of a position limit
 
 @dataclass(frozen=True, eq=False)
 class ArmMotion:
-    """A joint motion of an arm, with derived quantities for each sample.
+    """A motion of an arm's joints, and quantities that are computed from it for each sample.
 
     Attributes:
         dt: sampling period [s].
@@ -51,7 +51,7 @@ class ArmMotion:
         Velocity and acceleration are central differences of the positions.
 
         Args:
-            arm: whose motion.
+            arm: arm that moves.
             times: at least 4 evenly spaced times, shape (n,) [s].
             joints: joint positions, shape (n, n_joints) [rad].
 
@@ -97,8 +97,8 @@ class Violations:
         velocity: number of frames in which a joint exceeds its velocity limit.
         acceleration: number of frames in which a joint exceeds its acceleration limit.
         position_excess: largest distance of a joint from its range [rad]; 0 when all joints are inside.
-        velocity_ratio: largest velocity relative to its limit.
-        acceleration_ratio: largest acceleration relative to its limit.
+        velocity_ratio: largest velocity of a joint, divided by the joint's limit.
+        acceleration_ratio: largest acceleration of a joint, divided by the joint's limit.
     """
 
     position: int
@@ -139,20 +139,21 @@ def path_length(positions: ArrayLike) -> float:
 
 
 def jerk_rms(positions: ArrayLike, dt: float) -> float:
-    """Return the RMS jerk of ``values`` (n, d), from third differences divided by dt^3 [unit of ``values`` / s^3]."""
+    """Return the RMS jerk of ``positions`` (n, d), from third differences divided by dt^3 [unit of positions / s^3]."""
     jerk = np.diff(np.asarray(positions, dtype=float), 3, axis=0) / dt**3
     return float(np.sqrt(np.mean(np.sum(jerk * jerk, axis=1))))
 
 
 def spectral_arc_length(speed: ArrayLike, dt: float) -> float:
-    r"""Return the smoothness of a motion as the arc length of its speed's spectrum; 0 is smoothest.
+    r"""Return the smoothness of a motion from the arc length of its speed's spectrum; the closer to 0, the smoother.
 
     .. math:: -\int_0^{\omega_c} \sqrt{\left(\tfrac{1}{\omega_c}\right)^2
               + \left(\tfrac{d\hat V}{d\omega}\right)^2}\, d\omega, \qquad \hat V = |V(\omega)| / |V(0)|
 
-    Here, :math:`\omega_c` is the largest frequency up to 20 Hz at which :math:`\hat V` exceeds 0.05. The measure is
-    called SPARC (Balasubramanian et al., Journal of NeuroEngineering and Rehabilitation, 2015). The value also depends
-    on the number of movements in a recording, so compare only motions of the same recording.
+    Here, V is the Fourier transform of the speed, and :math:`\omega_c` is the largest frequency up to 20 Hz at which
+    :math:`\hat V` exceeds 0.05. The measure is called SPARC (Balasubramanian et al., Journal of NeuroEngineering and
+    Rehabilitation, 2015). The value also depends on the number of movements in a recording, so compare only motions of
+    the same recording.
 
     Args:
         speed: speed of a point, shape (n,) [m/s].
@@ -176,12 +177,13 @@ def spectral_arc_length(speed: ArrayLike, dt: float) -> float:
 
 
 def log_dimensionless_jerk(positions: ArrayLike, dt: float) -> float:
-    r"""Return the smoothness of a motion as its logarithmic dimensionless jerk; the closer to 0, the smoother.
+    r"""Return the smoothness of a motion from its logarithmic dimensionless jerk; the closer to 0, the smoother.
 
     .. math:: -\ln \left( \frac{T^3}{v_{peak}^2} \int_0^T \lVert \dddot x \rVert^2 \, dt \right)
 
-    The value does not depend on the duration T or on the size of the motion. A minimum-jerk motion has -ln(204.8) =
-    -5.32 (Balasubramanian et al., Journal of NeuroEngineering and Rehabilitation, 2015).
+    Here, x is the position and :math:`v_{peak}` the largest speed. The value does not depend on the duration T or on
+    the size of the motion. A minimum-jerk motion has -ln(204.8) = -5.32 (Balasubramanian et al., Journal of
+    NeuroEngineering and Rehabilitation, 2015).
 
     Args:
         positions: shape (n, d), evenly spaced in time, n at least 4 [m].

@@ -21,9 +21,9 @@ class PathStyle:
     r"""The difference between an executed path and the mean of the demonstrations, compared as curves.
 
     Both paths are resampled at 200 points that are evenly spaced along the arc, so timing does not matter. Dynamic time
-    warping then matches the points x_i of the executed path with points m_j of the mean path, in order, so that the
-    sum of squared distances is smallest. With P for the set of matched pairs and :math:`\Sigma_j` for the covariance of
-    the demonstrations at m_j:
+    warping then matches the points x_i of the executed path with points m_j of the mean path. It keeps the order of the
+    points and minimises the sum of squared distances. Let P be the set of matched pairs, and :math:`\Sigma_j` the
+    covariance of the demonstrations at m_j:
 
     .. math:: \mathrm{rmse}^2 = \frac1{|P|} \sum_{(i,j) \in P} |x_i - m_j|^2, \qquad
               \mathrm{deviation} = \max_i \min_{j: (i,j) \in P} \sqrt{(x_i - m_j)^T \Sigma_j^{-1} (x_i - m_j)}
@@ -67,12 +67,12 @@ def path_style(executed: Trajectory, learned: Trajectory, covariances: Array) ->
 
 
 def tilts(learned: Trajectory, positions: Array, quaternions: Array) -> tuple[Array, NDArray[np.intp]]:
-    """Return the rotation of poses away from the learned rotation at the nearest sample of a learned path.
+    """Return the angle between the rotation of each pose and the rotation at the nearest sample of a learned path.
 
     Args:
         learned: the learned path with its rotations.
-        positions: shape (m, 3) [m].
-        quaternions: tool_to_base, wxyz, shape (m, 4).
+        positions: positions of the m poses, shape (m, 3) [m].
+        quaternions: rotations of the poses, tool_to_base, wxyz, shape (m, 4).
 
     Returns:
         angles (m,) [rad], and index of the nearest sample of the learned path, shape (m,).

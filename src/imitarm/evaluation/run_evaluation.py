@@ -29,19 +29,19 @@ _FOLLOWS = 0.5  # of the hand's own motion (RMS); a tool with a larger error doe
 
 @dataclass(frozen=True)
 class TargetTracking:
-    """How well the tool tracked the target that the retargeting method computed.
+    """How closely the tool tracked the target that the retargeting method computed.
 
     The tool tracked the target if three conditions hold: the robot was engaged for at least half of the time, the RMS
     distance was at most :data:`FAR`, and the tool was farther away than :data:`FAR` for at most :data:`FAR_FRACTION` of
-    the time with a target. FAR is 5 cm: at this distance from its target, a gripper is still at the object
-    that it should grasp. The method ``modern``, with its normal lag, exceeds neither FAR nor FAR_FRACTION.
+    the time with a target. FAR is 5 cm: at this distance from its target, a gripper is still at the object that it
+    should grasp. The normal lag of the method ``modern`` is small enough for these conditions.
 
     Attributes:
         title: title of the method.
-        rms: root mean square distance to the target [m]; nan when there was no target.
+        rms: root mean square distance between tool and target [m]; nan when there was no target.
         far_fraction: ``far_time`` divided by the time in which there was a target, 0 to 1; nan without a target.
         far_time: time in which the tool was farther away than :data:`FAR` [s].
-        farthest: largest distance to the target [m]; nan without a target.
+        farthest: largest distance between tool and target [m]; nan without a target.
         engagements: number of times that the robot began to follow the person.
         engaged_fraction: fraction of the whole time in which the robot was engaged (following, coasting, holding), 0 to
             1.
@@ -59,10 +59,10 @@ class TargetTracking:
 
     @classmethod
     def of(cls, run: Retargeting, metrics: MappingMetrics) -> TargetTracking:
-        """Compute how well the tool of a run tracked its target.
+        """Compute how closely the tool tracked its target in a run.
 
         Args:
-            run: run of a method.
+            run: run of a retargeting method.
             metrics: metrics of this run.
         """
         away = np.linalg.norm(run.arm.tool_path(run.joints)[0] - run.targets[0], axis=1)
@@ -147,9 +147,9 @@ def evaluate_run(
     """Measure the quality of a retargeting run.
 
     Args:
-        run: run of a method.
-        skeletons: skeletons of the person, the input of the method.
-        correspondence: correspondence between person and robot, the input of the method.
+        run: run of a retargeting method.
+        skeletons: skeletons of the person, which were the input of the method.
+        correspondence: arm, scale, orientation and sensor pose by which the method related the person to the robot.
         truth: true positions of the person over time; None: the camera's measurements are used instead.
 
     Raises:
@@ -185,9 +185,9 @@ def warnings_of(
     """Return remarks for the user about a run, one sentence each.
 
     Args:
-        run: run of a method.
+        run: run of a retargeting method.
         metrics: metrics of the run.
-        tracking: tracking result of the run.
+        tracking: how closely the tool tracked its target in the run.
         link_distance: smallest distance between links that are not neighbours [m].
     """
     dt = float(run.times[1] - run.times[0])
@@ -207,8 +207,9 @@ def warnings_of(
     wound = winding(run)
     if wound > _WOUND:
         lines.append(
-            f"the target of the tool rotated about the vertical by {np.degrees(wound):.0f} degrees in all: while a "
-            "hand points straight up or down, its heading is unknown; --orientation fixed keeps the tool's rotation"
+            f"the target of the tool rotated about the vertical by {np.degrees(wound):.0f} degrees in total, because "
+            "the heading of a hand that points straight up or down is unknown; --orientation fixed keeps the "
+            "tool's rotation"
         )
     exceeded = {
         "position": metrics.position_violations,
@@ -224,8 +225,8 @@ def warnings_of(
         )
     if run.closed.any():
         lines.append(
-            "the person's hand closed during the motion; a demonstration does not contain gripper "
-            "commands, so this is lost"
+            "the person's hand closed during the motion; the demonstration does not contain this, because "
+            "demonstrations have no gripper commands"
         )
     return lines
 

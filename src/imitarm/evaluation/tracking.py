@@ -57,7 +57,7 @@ class TrueArm:
         Args:
             truth: function of time that returns the person's skeleton; it is called with increasing times.
             times: times of a run, shape (n,) [s].
-            correspondence: correspondence with the side of the arm and the pose of the sensor.
+            correspondence: object that states the side of the arm and the pose of the sensor.
             start: time at which the first skeleton was measured, on the clock of ``truth`` [s]; it is added to
                 ``times`` before ``truth`` is called.
         """
@@ -73,7 +73,7 @@ class TrueArm:
         Args:
             times: time stamps, shape (n,) [s].
             points: shoulder, elbow, wrist, hand, hand tip, thumb, in the sensor's frame, shape (n, 6, 3) [m].
-            correspondence: correspondence with the pose of the sensor.
+            correspondence: object that states the pose of the sensor.
         """
         t, points = np.asarray(times, dtype=float), correspondence.sensor_to_base.apply(points)
         hands, hand = np.empty((len(t), 3, 3)), np.eye(3)
@@ -84,20 +84,20 @@ class TrueArm:
         return cls(t, points[:, 0], points[:, 1], points[:, 2], matrix_to_quaternion(hands))
 
     def wrist_at(self, times: Array) -> Array:
-        """Return the position of the wrist at times (m,) [s], (m, 3) [m]; outside the recorded times it is constant."""
+        """Return the wrist positions (m, 3) [m] at ``times`` (m,) [s], which are constant outside of the recording."""
         return np.column_stack([np.interp(times, self.times, column) for column in self.wrist.T])
 
 
 def seen_arm(skeletons: Sequence[Skeleton], times: ArrayLike, correspondence: Correspondence) -> TrueArm:
     """Return a person's arm as the camera measured it, including noise, interpolated linearly between frames.
 
-    If a run is compared with a recorded arm, the camera's noise adds to the error of every method, and a smooth method
-    appears slightly worse than it is.
+    If a run is compared with this arm, the camera's noise adds to the error of every method. A method with smooth
+    output then appears slightly worse than it is.
 
     Args:
         skeletons: skeletons in order of time.
         times: times since the first skeleton, shape (n,) [s].
-        correspondence: correspondence with the side of the arm and the pose of the sensor.
+        correspondence: object that states the side of the arm and the pose of the sensor.
 
     Raises:
         TaskFailedError: when shoulder, elbow and wrist are never seen together.
@@ -123,7 +123,7 @@ def seen_arm(skeletons: Sequence[Skeleton], times: ArrayLike, correspondence: Co
 
 @dataclass(frozen=True, eq=False)
 class EngagementPeriods:
-    """The frames of a run in which the robot was engaged (following, coasting, holding), and the starts of engagements.
+    """The frames in which the robot was engaged (following, coasting or holding), and the starts of the engagements.
 
     Attributes:
         engaged: for each frame, whether the robot was engaged, shape (n,).
@@ -168,20 +168,20 @@ def reference_positions(
     engagement began, and :math:`p_{home}` is the position of the tool at the time :math:`t_e`.
 
     Args:
-        true: the person's arm, in the axes of the base.
+        true: the person's true arm, in the axes of the base.
         tool: positions of the tool, shape (n, 3) [m].
         periods: the engaged frames.
-        scale: rho.
+        scale: rho, displacement of the tool divided by the displacement of the wrist.
         lag: time by which the tool lags behind the wrist [s].
 
     Returns:
-        shape (n, 3) [m]; undefined in frames that are not engaged.
+        Correct positions of the tool, shape (n, 3) [m]; undefined in frames that are not engaged.
     """
     return tool[periods.start] + scale * (true.wrist_at(true.times - lag) - true.wrist[periods.start])
 
 
 def reference_rotations(true: TrueArm, quaternions: Array, periods: EngagementPeriods, orientation: str) -> Array:
-    """Return the correct rotations of the tool (n, 4), wxyz, which the clutch law computes from the true hand.
+    """Return the correct rotations of the tool, which the clutch law computes from the true hand: (n, 4), wxyz.
 
     Args:
         true: the person's arm, in the axes of the base.
@@ -213,9 +213,9 @@ def rms(errors: ArrayLike) -> float:
 def best_lag(true: TrueArm, tool: Array, periods: EngagementPeriods, scale: float) -> tuple[float, float]:
     """Return the constant lag that explains the tool's motion best [s], and the RMS error after removing this lag [m].
 
-    Lags from -0.1 to 0.8 s are tried. The best lag is the minimum of a parabola through three points: the lag with the
-    smallest error and its two neighbours. The lag and the error are nan if no frame is engaged. The lag is also nan if
-    the hand did not move.
+    Lags from -0.1 to 0.8 s are tried. A parabola is fitted to the errors of the lag with the smallest error and of its
+    two neighbours. The best lag is the minimum of this parabola. The lag and the error are nan if no frame is engaged.
+    The lag is also nan if the hand did not move.
     """
     engaged = periods.engaged
     if not engaged.any():
@@ -270,9 +270,9 @@ def rotation_errors(first: Array, second: Array) -> Array:
 def elbow_direction_errors(true: TrueArm, sew: Array, periods: EngagementPeriods) -> Array:
     """Return the angle between the actual and the correct direction of the robot's upper arm, shape (n,) [rad].
 
-    The correct direction is the direction of the robot's upper arm at the start of the engagement, rotated by the
-    rotation of the person's upper arm since that time. The rotation of the person's upper arm is the smallest rotation
-    that takes its direction at the start of the engagement to its current direction.
+    Let R be the smallest rotation that takes the direction of the person's upper arm at the start of the engagement to
+    its current direction. The correct direction is R applied to the direction of the robot's upper arm at the start of
+    the engagement.
 
     Args:
         true: the person's arm, in the axes of the base.
@@ -296,7 +296,8 @@ def elbow_angle_errors(true: TrueArm, sew: Array, periods: EngagementPeriods) ->
         periods: the engaged frames.
 
     Returns:
-        shape (n,) [rad], 0 to pi; nan where one of the arms is so straight that its swivel angle is poorly defined.
+        Errors, shape (n,) [rad], 0 to pi; nan where the person's or the robot's arm is too straight for a well-defined
+        swivel angle.
     """
     person = sew_derivatives(true.shoulder, true.elbow, true.wrist)
     robot = sew_derivatives(sew[:, 0], sew[:, 1], sew[:, 2])
@@ -312,9 +313,9 @@ def motion_end(times: ArrayLike, positions: ArrayLike, radius: float = 0.01, res
 
     Args:
         times: time stamps, shape (n,) [s].
-        positions: shape (n, 3) [m].
-        radius: [m].
-        rest: [s].
+        positions: positions of the point, shape (n, 3) [m].
+        radius: largest distance from the final position [m].
+        rest: duration of the final part over which the mean is taken [s].
     """
     t, p = np.asarray(times, dtype=float), np.asarray(positions, dtype=float)
     away = np.linalg.norm(p - p[t >= t[-1] - rest].mean(axis=0), axis=1)

@@ -1,1 +1,1 @@
-"""Text and numbers on disk: writing files atomically, reading tables, and files that grow line by line."""
+"""Text and numbers on disk: files that are written as a whole, tables of numbers, files that grow line by line."""

@@ -13,7 +13,7 @@ Document = TypeVar("Document")
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write text to a temporary file, then rename it to ``path``; an existing file stays intact until the renaming.
+    """Write text to a temporary file, then rename the file to ``path``; until then, an existing file stays intact.
 
     Args:
         path: file to write; an existing file is replaced.

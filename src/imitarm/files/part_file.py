@@ -14,18 +14,18 @@ PART = ".part"
 
 
 class PartFile:
-    """A text file for recorders, which is called ``PATH.part`` until it is finished, and ``PATH`` afterwards.
+    """A text file for recorders; the file is called ``PATH.part`` until it is finished, and ``PATH`` afterwards.
 
     :meth:`write` hands its text to the operating system before it returns. If the program is killed, ``PATH.part``
     therefore contains all written text. An older file ``PATH`` stays intact until the new one is complete.
 
     Args:
-        path: final name.
-        begin: text that is written first.
+        path: path of the finished file.
+        begin: text at the beginning of the file.
         replace: whether an existing file may be replaced.
 
     Attributes:
-        path: final name.
+        path: path of the finished file.
         part: path of the file until it is finished.
 
     Raises:
@@ -53,7 +53,7 @@ class PartFile:
             raise InputError(f"{self.part}: can't be written: {error.strerror or error}") from error
 
     def write(self, text: str) -> None:
-        """Append a text.
+        """Append text to the file.
 
         Raises:
             InputError: when the file is finished, or the disk is full.
@@ -67,7 +67,7 @@ class PartFile:
             raise InputError(f"{self.part}: can't be written: {error.strerror or error}") from error
 
     def finish(self, take: Callable[[Path], bool], *, begin: str = "") -> None:
-        """Write all text to the disk, then call ``take``, which makes ``PATH`` from ``PATH.part``.
+        """Write all text to the disk, then call ``take``, which creates ``PATH`` from ``PATH.part``.
 
         Calling this method again does nothing.
 
@@ -76,7 +76,7 @@ class PartFile:
                 and returns whether ``PATH.part`` was renamed. If ``take`` returns False, ``PATH.part`` is removed. If
                 ``take`` returns True, no file is removed, because a file ``PATH.part`` that exists after the renaming
                 belongs to another recorder.
-            begin: text that replaces the ``begin`` given to the constructor; both must have the same length.
+            begin: text that replaces the text ``begin`` of the constructor; the two texts must have the same length.
 
         Raises:
             InputError: when the file can't be completed; the written text stays in ``part``.

@@ -77,8 +77,8 @@ def read_bytes(path: str | Path) -> bytes:
     """Return the bytes of a file.
 
     Raises:
-        InputError: when it can't be opened.
-        FileFormatError: when it is empty.
+        InputError: when the file can't be opened.
+        FileFormatError: when the file is empty.
     """
     try:
         content = Path(path).read_bytes()
@@ -90,7 +90,7 @@ def read_bytes(path: str | Path) -> bytes:
 
 
 def kind_of(content: bytes) -> str | None:
-    """Return what kind of binary file this is, from its first bytes; None when it looks like text."""
+    """Return the kind of a binary file, from the first bytes of its ``content``; None when they look like text."""
     for signature, kind in SIGNATURES.items():
         if content.startswith(signature):
             return kind
@@ -117,7 +117,7 @@ def _text_of(path: str | Path, content: bytes) -> str:
 def split_names(text: str) -> tuple[str, ...]:
     """Split a line of column names.
 
-    A unit in brackets belongs to the name before it, so ``t (s) x (m)`` gives two names.
+    A unit in brackets belongs to the name before the unit, so ``t (s) x (m)`` gives two names.
     """
     separator = _separator(text)
     if separator is not None:
@@ -221,7 +221,7 @@ def parse_table(path: str | Path, content: bytes) -> Table:
 
     Args:
         path: the name of the file, for messages.
-        content: the file's bytes, or the part of them to read.
+        content: bytes of the file, or of the part that is to be read.
 
     Raises:
         FileFormatError: for the same reasons as :func:`read_table`.

@@ -1,4 +1,4 @@
-"""Read XML as a tree of elements that know their line number, so that error messages can name the line."""
+"""Read XML as a tree of elements with line numbers, so that error messages can name the line."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class XmlElement:
         return [child for child in self.children if child.tag == tag]
 
     def walk(self) -> Iterator[XmlElement]:
-        """Yield this element and all elements inside it, in the order of the file."""
+        """Yield this element and all elements inside this element, in the order of the file."""
         pending = [self]
         while pending:  # not recursive, so that no depth of nesting is too deep
             element = pending.pop()
@@ -51,7 +51,7 @@ def read_xml(path: Path, expected: str = "") -> XmlElement:
     """Read an XML file and return its root element.
 
     Args:
-        path: the file.
+        path: path of the file.
         expected: expected type of the file, for example ``"an MJCF or URDF file"``; used in error messages.
 
     Raises:

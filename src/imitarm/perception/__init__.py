@@ -1,4 +1,4 @@
-"""Perception of obstacles with a camera: depth images, the obstacles found in them, and their motion."""
+"""Perception of obstacles with a camera: depth images, detected obstacles, and the motion of the obstacles."""
 
 from __future__ import annotations
 

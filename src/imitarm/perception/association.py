@@ -1,4 +1,4 @@
-"""Association: which detection belongs to which track."""
+"""Association: decide which detection belongs to which track."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ _NONE = np.empty(0, dtype=np.intp)
 
 
 class Pairs(NamedTuple):
-    """Tracks and the detections that were assigned to them.
+    """Pairs of a track and the detection that was assigned to this track.
 
     Attributes:
-        tracks: indices of tracks, shape (k,).
-        detections: index of the detection of each of these tracks, shape (k,).
-        distances: normalised innovation squared of each pair, shape (k,).
-        innovation: innovations of the pairs; None if they must be computed again.
+        tracks: index of the track of each pair, shape (k,).
+        detections: index of the detection of each pair, shape (k,).
+        distances: normalised innovation squared ``d^2`` of each pair (see :func:`assign`), shape (k,).
+        innovation: innovations of the pairs, that is, measured minus predicted positions; None if they must be computed
+            again.
     """
 
     tracks: Indices
@@ -34,12 +35,12 @@ class Pairs(NamedTuple):
     innovation: Innovation | None = None
 
     def joined(self, other: Pairs) -> Pairs:
-        """Return both sets of pairs."""
+        """Return the pairs of both objects as one object."""
         tracks, detections, distances = (np.concatenate(pair) for pair in zip(self[:3], other[:3], strict=True))
         return Pairs(tracks, detections, distances)
 
     def in_order(self) -> Pairs:
-        """Return the pairs in the order of their tracks."""
+        """Return the pairs, sorted by the index of the track."""
         order = self.tracks.argsort()
         return Pairs(self.tracks[order], self.detections[order], self.distances[order])
 
@@ -50,19 +51,20 @@ NO_PAIRS = Pairs(_NONE, _NONE, np.empty(0))
 def assign(
     positions: Array, covariances: Array, measured: Measurements, gate: float, allowed: NDArray[np.bool_] | None = None
 ) -> Pairs:
-    """Assign detections to tracks, each at most once.
+    """Assign detections to tracks; each detection and each track is used at most once.
 
-    With the innovation ``nu`` of a pair and its covariance ``S``, a pair is possible if its normalised innovation
-    squared ``d^2 = nu' S^-1 nu`` is at most ``gate``, the quantile of the chi-square distribution with 3 degrees of
-    freedom. Among the assignments with the most pairs, the one with the smallest sum of ``d^2 + log det S`` is chosen:
-    the most probable one.
+    The innovation ``nu`` of a pair is the measured minus the predicted position, and ``S`` is its covariance. A pair is
+    possible if the normalised innovation squared ``d^2 = nu' S^-1 nu`` is at most ``gate``, a quantile of the
+    chi-square distribution with 3 degrees of freedom. The function considers only assignments with the largest possible
+    number of pairs. Among these, it chooses the most probable assignment, which has the smallest sum of
+    ``d^2 + log det S``.
 
     Args:
         positions: predicted positions of n tracks, shape (n, 3) [m].
         covariances: covariances of these positions, shape (n, 3, 3) [m^2].
-        measured: m measurements.
-        gate: largest possible ``d^2``.
-        allowed: pairs that may be assigned, shape (n, m); None: all.
+        measured: the m measured positions with their covariances.
+        gate: largest ``d^2`` of a possible pair.
+        allowed: whether each pair may be assigned, shape (n, m); None: every pair may.
     """
     n, m = len(positions), len(measured.positions)
     if not n or not m:
@@ -96,7 +98,7 @@ def _near(
 
 
 def squared_distances(first: Array, second: Array) -> Array:
-    """Return the squared distances (n, m) of points (n, 3) and (m, 3), at most a rounding error too small."""
+    """Return the squared distances (n, m) [m^2] between points (n, 3) and (m, 3), correct up to rounding errors."""
     offsets: Array = first.T[:, :, None] - second.T[:, None]
     offsets *= offsets
     return np.asarray(offsets[0] + offsets[1] + offsets[2])
@@ -116,9 +118,10 @@ def _best(tracks: Indices, detections: Indices, distance: Array, log: Array, sha
 
 
 def duplicates(measured: Measurements, gate: float) -> list[tuple[int, int]]:
-    """Return the pairs ``(i, j)`` of measurements, ``i < j``, whose positions do not differ significantly.
+    """Return the pairs ``(i, j)``, ``i < j``, of measurements whose positions do not differ significantly.
 
-    The squared distance of the positions, normalised with the sum of both covariances, is at most ``gate``.
+    "Not significantly" means that the squared distance of the positions, normalised by the sum of their covariances, is
+    at most ``gate``.
     """
     positions, noise = measured.positions, measured.noise
     if len(positions) < 2:
@@ -139,7 +142,7 @@ def duplicates(measured: Measurements, gate: float) -> list[tuple[int, int]]:
 
 
 def matching_labels(labels: Sequence[str], others: Sequence[str]) -> NDArray[np.bool_] | None:
-    """Return which labels may belong to the same obstacle, shape (n, m); None: all."""
+    """Return whether labels i and j may belong to one obstacle, shape (n, m); None if this is so for all pairs."""
     if not any(labels) or not any(others):
         return None
     return np.array([[not a or not b or a == b for b in others] for a in labels])

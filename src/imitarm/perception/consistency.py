@@ -1,4 +1,4 @@
-"""Consistency: whether the errors of a filter are as large as the filter says."""
+"""Consistency: compares the errors of a filter with the covariance that the filter reports."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Consistency:
-    """The mean of a normalised error squared, beside the values that are expected of a correct filter.
+    """The mean normalised squared error of a filter, and the band in which the mean of a correct filter lies.
 
-    The normalised error squared is ``d^2 = e' C^-1 e``, where ``C`` is the covariance of the error ``e`` according to
-    the filter. For a correct filter, ``d^2`` has a chi-square distribution with as many degrees of freedom as ``e`` has
-    components. With the innovation as error, it is called NIS; with the error of the estimate, NEES. Detections outside
-    the gate are never assigned, so the distribution of the NIS ends at the gate. The *band* contains the mean of
-    ``count`` independent values with a probability of 95 %. A mean above the band: the filter is too confident (the
-    noise is larger than stated). Below the band: the filter is too cautious.
+    The normalised squared error is ``d^2 = e' C^-1 e``, where ``C`` is the filter's covariance of the error ``e``. For
+    a correct filter, ``d^2`` has a chi-square distribution with as many degrees of freedom as ``e`` has components. If
+    ``e`` is the innovation, ``d^2`` is called NIS; if ``e`` is the error of the estimate, ``d^2`` is called NEES.
+    Detections outside the gate are never assigned, so the NIS never exceeds the gate. The *band* contains the mean of
+    ``count`` independent values with a probability of 95 %. If the mean is above the band, the filter is too confident:
+    the true noise is larger than the assumed noise. If the mean is below the band, the filter is too cautious.
 
     Attributes:
         mean: mean of ``d^2``; nan without values.
@@ -43,21 +43,21 @@ class Consistency:
 
     @property
     def band(self) -> tuple[float, float]:
-        """Both ends of the band."""
+        """Lower and upper end of the band."""
         return self.low, self.high
 
     @classmethod
     def of(
         cls, values: Array, degrees: int = 3, *, gate: float = math.inf, independent: float | None = None
     ) -> Consistency:
-        """Return the mean of normalised errors squared, and its band.
+        """Return the mean of normalised squared errors, and the band of a correct filter.
 
         Args:
-            values: normalised errors squared, shape (n,).
+            values: normalised squared errors, shape (n,).
             degrees: number of components of the error.
-            gate: largest possible value.
-            independent: number of independent values among them; None: all. The errors of successive estimates are
-                correlated, so that they contain fewer.
+            gate: largest possible value; inf without a gate.
+            independent: effective number of independent values; None: all values are independent. The errors of
+                successive estimates are correlated, so their effective number is smaller.
         """
         n = float(len(values)) if independent is None else independent
         expected, variance = chi_square_moments(degrees, gate)
@@ -75,14 +75,14 @@ class Consistency:
 
 
 def chi_square_quantile(probability: float, degrees: int) -> float:
-    """Return the value below which a chi-square variable lies with the given probability."""
+    """Return the chi-square quantile for a ``probability`` and the number of ``degrees`` of freedom."""
     from scipy.special import gammaincinv  # noqa: PLC0415  slow to import
 
     return 2.0 * float(gammaincinv(0.5 * degrees, probability))
 
 
 def chi_square_moments(degrees: int, gate: float = math.inf) -> tuple[float, float]:
-    """Return mean and variance of a chi-square variable that is below ``gate``."""
+    """Return mean and variance of a chi-square variable, restricted to values below ``gate``."""
     if math.isinf(gate):
         return float(degrees), 2.0 * degrees
     from scipy.special import gammainc  # noqa: PLC0415

@@ -1,4 +1,4 @@
-"""DepthFrame: one image of a depth camera, with everything needed to convert it to points in the base frame."""
+"""DepthFrame: one image of a depth camera, with the camera's pose and intrinsics."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Intrinsics:
 
     @classmethod
     def from_field_of_view(cls, width: int, height: int, vertical: float) -> Intrinsics:
-        """Return the camera with square pixels, a centred optical axis and the given vertical field of view [rad]."""
+        """Return a camera with square pixels, a centred optical axis and the ``vertical`` field of view [rad]."""
         height = whole_number(height, "height", at_least=1)
         angle = finite_number(vertical, "vertical field of view", "rad", above=0.0)
         if angle >= np.pi:
@@ -83,13 +83,14 @@ class Intrinsics:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DepthFrame:
-    """One depth picture.
+    """One depth image.
 
     Attributes:
         stamp: time at which the image was taken [s].
-        depth: distance of the surface from the camera's plane (its z, not the length of the ray), shape
-            (height, width) [m]; nan where nothing was measured. 0 and infinity are replaced by nan.
-        intrinsics: the camera.
+        depth: depth of the surface at each pixel, shape (height, width) [m]. The depth is the coordinate z in the
+            camera's frame, not the length of the ray. Pixels without a measurement are nan; 0 and infinity are replaced
+            by nan.
+        intrinsics: intrinsic parameters of the camera.
         camera_to_base: pose of the camera when the image was taken.
         color: red, green and blue of each pixel, 0 to 1, shape (height, width, 3); None for a camera without colours.
 

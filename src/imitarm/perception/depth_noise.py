@@ -1,4 +1,4 @@
-"""Noise of a depth camera: how much a measured depth varies, and simulated images with this noise."""
+"""Noise of a depth camera: the standard deviation of a measured depth, and simulated images with this noise."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ class DepthNoise:
 
     The standard deviation of a depth ``z`` is :math:`\sigma(z) = a + b\,(z - z_0)^2`. The default values are those that
     Nguyen, Izadi and Lovell measured for a Kinect (*Modeling Kinect sensor noise for improved 3D reconstruction and
-    tracking*, 3DIMPVT 2012): 1.2 mm at 0.4 m, 6 mm at 2 m and 41 mm at 5 m. A Kinect v2 measures better than this.
+    tracking*, 3DIMPVT 2012): 1.2 mm at 0.4 m, 6 mm at 2 m and 41 mm at 5 m. A Kinect v2 is more accurate.
 
     Attributes:
         offset: ``a``, standard deviation at the depth ``z_0`` [m].
-        growth: ``b``, how it grows with the square of the distance from ``z_0`` [1/m].
-        nearest: ``z_0`` [m].
-        edge_dropout: probability that a pixel at a depth edge is lost; an edge is a jump of more than 5 cm to a
-            neighbouring pixel.
+        growth: ``b``, increase of the standard deviation with the squared difference from ``z_0`` [1/m].
+        nearest: ``z_0``, depth with the smallest standard deviation [m].
+        edge_dropout: probability that a pixel at a depth edge is lost. At a depth edge, the depths of two neighbouring
+            pixels differ by more than 5 cm.
         dropout: probability that any other pixel is lost.
-        mixed: probability that a pixel at a depth edge, if not lost, measures a depth between the two surfaces.
-        step: step to which depths are rounded [m]; 0: not rounded.
+        mixed: probability that a pixel at a depth edge, if it is not lost, measures a depth between the two surfaces.
+        step: depths are rounded to multiples of this step [m]; 0: depths are not rounded.
 
     Raises:
         InputError: when a number is negative or not finite, or a probability is above 1.
@@ -51,11 +51,11 @@ class DepthNoise:
 
     @classmethod
     def none(cls) -> DepthNoise:
-        """Return the noise of an exact camera."""
+        """Return the noise of an ideal camera: all attributes are zero."""
         return cls(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
     def sigma(self, depth: ArrayLike) -> Array:
-        """Return the standard deviation of measured depths [m], including the rounding.
+        """Return the standard deviation of measured depths, including the error of rounding, shape (...) [m].
 
         Args:
             depth: depths, shape (...) [m].

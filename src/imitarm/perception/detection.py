@@ -23,21 +23,21 @@ _NEAREST = 1e-3  # [m] depth at which a camera's coordinates are still defined
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """A shape at the pose at which a sensor measured it.
+    """The shape of an obstacle at the pose that a sensor measured.
 
-    The measured position ``z`` is the origin of the obstacle's local frame (its centre, for most shapes). Its error has
-    zero mean and the covariance ``R``.
+    The measured position ``z`` is the origin of the obstacle's local frame (its centre, for most shapes). The error of
+    ``z`` has zero mean and the covariance ``R``.
 
     Attributes:
-        obstacle: the shape at the measured pose in the base frame. Its velocity is ignored. Half-spaces are fixtures
-            and can't be tracked.
+        obstacle: the shape at the measured pose in the base frame; its velocity is ignored. A half-space is not
+            allowed, because it can't be tracked.
         covariance: covariance ``R`` of the measured position in the base frame, shape (3, 3) [m^2].
-        label: kind of object, for example its colour, if the sensor knows it. Detections with different labels are
-            never taken for the same obstacle; an empty label matches every label.
+        label: kind of object that the sensor recognised, for example a colour. Detections with different labels never
+            count as the same obstacle; an empty label matches every label.
         camera_to_base: pose of the camera that took the measurement. Only the extended Kalman filter uses it.
-        solid: geometry of the obstacle.
-        row: position (3), covariance (9) and size (3) as one row, which a tracker stacks. The variances in it are not
-            smaller than (1 nm)^2, so that two exact detections at the same time stay solvable.
+        solid: geometry of the obstacle, without pose and velocity.
+        row: position (3), covariance (9) and size (3) in one row, shape (15,). Each variance in the row is at least 1
+            nm^2, so that the covariance of an exact detection can be inverted.
 
     Raises:
         InputError: when the obstacle can't be tracked, the covariance is not symmetric and positive semi-definite, or
@@ -85,7 +85,7 @@ class Detection:
         return self.solid.position
 
     def repeats(self, other: Detection) -> bool:
-        """Return whether the other detection has the same shape, pose, covariance and label."""
+        """Return whether ``other`` has the same shape, pose, covariance and label as this detection."""
         return self is other or (
             self.solid.kind == other.solid.kind
             and self.label == other.label
@@ -95,10 +95,10 @@ class Detection:
 
 
 def resized(obstacle: Obstacle, size: Array) -> Obstacle:
-    """Return the obstacle with another size, at the same pose.
+    """Return ``obstacle`` with a new size, at the same pose.
 
     Args:
-        obstacle: the obstacle; a convex hull is returned unchanged, because its points have no size.
+        obstacle: obstacle to resize; a convex hull is returned unchanged, because it has no size parameters.
         size: new size in the form of :class:`~imitarm.scene.distances.PackedObstacles`, shape (3,) [m].
     """
     if isinstance(obstacle, Sphere):
@@ -121,15 +121,15 @@ def estimated(
 ) -> Obstacle:
     """Return a detected obstacle at its estimated position, with velocity, covariance, track number and name.
 
-    The values must be valid.
+    The values are not checked.
 
     Args:
-        obstacle: the obstacle; its rotation and size are kept, its angular velocity becomes 0.
-        position: origin of the local frame, shape (3,) [m].
-        velocity: shape (3,) [m/s].
+        obstacle: detected obstacle; its rotation and size are kept, its angular velocity becomes 0.
+        position: estimated position of the local frame's origin, shape (3,) [m].
+        velocity: estimated velocity, shape (3,) [m/s].
         covariance: covariance of the position, shape (3, 3) [m^2].
         track_id: number of the track.
-        name: name of the result.
+        name: name of the returned obstacle.
     """
     quaternion = obstacle.solid().quaternion
     placed = copy.copy(obstacle.placed(position, quaternion, velocity, np.zeros(3)))

@@ -1,4 +1,4 @@
-"""Recordings of depth images and point clouds: files of arrays, without executable code."""
+"""Recordings of depth images and point clouds, in files that contain only arrays and no executable code."""
 
 from __future__ import annotations
 
@@ -26,15 +26,16 @@ _CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 
 @dataclass(frozen=True, eq=False)
 class FrameRecording:
-    """Recorded frames in the order of their stamps: a source of frames that needs no camera.
+    """Recorded frames (images or point clouds) in the order of their stamps, for use in place of a camera.
 
-    Iterate over it, or make it a camera of :class:`~imitarm.control_loop.CameraObserver` by :meth:`camera`.
+    Iterate over a recording, or use :meth:`camera` as a camera of :class:`~imitarm.control_loop.CameraObserver`.
 
     Attributes:
-        frames: the frames.
+        frames: recorded frames; their stamps increase.
 
     Raises:
-        InputError: when there is no frame, one is neither an image nor a point cloud, or the stamps do not increase.
+        InputError: when there is no frame, a frame is neither an image nor a point cloud, or the stamps do not
+            increase.
     """
 
     frames: tuple[Frame, ...]
@@ -58,13 +59,13 @@ class FrameRecording:
         return len(self.frames)
 
     def at(self, time: float) -> Frame | None:
-        """Return the newest frame that is not newer than ``time`` [s]; None before the first."""
+        """Return the last frame with a stamp up to ``time`` [s]; None if there is no such frame."""
         time = finite_number(time, "FrameRecording.at: time", "s")
         i = bisect_right([frame.stamp for frame in self.frames], time + 1e-9)
         return self.frames[i - 1] if i else None
 
     def camera(self, clock: Callable[[], float]) -> Callable[[], Frame | None]:
-        """Return a camera that shows the recording.
+        """Return a function that acts as a camera: each call returns the current frame of the recording.
 
         Args:
             clock: function that returns the current time on the clock of the stamps [s].
@@ -81,7 +82,7 @@ class FrameRecording:
             path: file, with the ending ``.npz``.
 
         Raises:
-            InputError: when the ending is another, or the file can't be written.
+            InputError: when the path does not end in ``.npz``, or the file can't be written.
         """
         path = file_path(path, "FrameRecording.save: path")
         if path.suffix != ".npz":
@@ -117,7 +118,7 @@ class FrameRecording:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
                 if int(arrays["version"]) != _VERSION:
                     raise FileFormatError(
-                        f"{path}: version {int(arrays['version'])} of the format; this program reads version {_VERSION}"
+                        f"{path}: has format version {int(arrays['version'])}, this program reads version {_VERSION}"
                     )
                 stamps: Sequence[float] = arrays["stamps"].tolist()
                 return cls(tuple(_frame(arrays, i, stamp) for i, stamp in enumerate(stamps)))

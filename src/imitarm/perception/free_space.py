@@ -1,4 +1,4 @@
-"""FreeSpace: where a depth image shows that nothing is, and where something may be hidden."""
+"""FreeSpace: which space a depth image shows to be empty, and which space may hide an obstacle."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ Mask = NDArray[np.bool_]
 
 
 class FreeSpace:
-    """The space that a camera has seen to be empty.
+    """The space that a camera saw to be empty.
 
-    A point is seen to be empty if the ray of its pixel ends behind it. A point behind a surface, outside of the image,
-    or in a pixel that measured nothing is hidden: an obstacle may be there. There is one exception: a pixel in
-    the middle of an area in which nothing was measured. Its ray counts as empty, because the surface behind this area
-    is out of the camera's range.
-    Points inside the known surfaces, such as a table, belong to no obstacle and count as empty.
+    Each pixel of a depth image has a ray, which ends at the measured depth. A point is empty if the ray of its pixel
+    ends behind the point. A point is hidden if it is behind a surface, outside of the image, or in a pixel without a
+    measurement: an obstacle may be there. There is one exception. If a pixel and its eight neighbours measured nothing,
+    the surface is probably out of the camera's range, so the ray of this pixel counts as empty. Points inside known
+    objects, such as a table, belong to no obstacle and count as empty.
 
     Args:
-        frame: the image; None: nothing is known, as for a point cloud.
+        frame: depth image; None: no space is known to be empty or hidden, for example with a point cloud.
         surfaces: known objects that are not obstacles, such as the table.
-        sigma: standard deviation of a depth as a function of the depth [m].
+        sigma: function that returns the standard deviation [m] of a depth [m].
     """
 
     def __init__(self, frame: DepthFrame | None, surfaces: Sequence[Obstacle], sigma: Callable[[Array], Array]) -> None:
@@ -42,11 +42,12 @@ class FreeSpace:
             self._base_to_camera = frame.camera_to_base.inverse()
 
     def empty(self, points: Array, margin: float = 0.01) -> Mask:
-        """Return which points (..., 3) are seen to be empty, shape (...).
+        """Return whether the camera saw that the points (..., 3) are empty, shape (...).
 
         Args:
             points: points in the base frame [m].
-            margin: distance by which the ray must pass the point, in addition to three standard deviations [m].
+            margin: least distance from the point to the end of the ray behind it, in addition to three standard
+                deviations [m].
         """
         empty = np.zeros(points.shape[:-1], dtype=bool)
         for surface in self._surfaces:
@@ -58,11 +59,12 @@ class FreeSpace:
             return empty | (measured > depth + margin + 3.0 * self._sigma(depth))
 
     def hidden(self, points: Array, margin: float = 0.01) -> Mask:
-        """Return which points (..., 3) are behind something that the camera saw, or outside of the image, shape (...).
+        """Return whether points (..., 3) are behind a surface that the camera saw or outside of the image, shape (...).
 
         Args:
             points: points in the base frame [m].
-            margin: distance by which the ray must end before the point, in addition to three standard deviations [m].
+            margin: least distance from the end of the ray to the point behind it, in addition to three standard
+                deviations [m].
         """
         if self._frame is None:
             return np.zeros(points.shape[:-1], dtype=bool)
@@ -84,7 +86,7 @@ class FreeSpace:
         return np.where(inside, self._depth[pixel], -np.inf), z
 
     def below(self, points: Array, reach: float) -> Array:
-        """Return the nearest points on the known surfaces of those ``points`` (n, 3) that are within ``reach`` [m]."""
+        """Return, for those ``points`` (n, 3) within ``reach`` [m] of a known surface, the nearest points on it [m]."""
         found = [np.zeros((0, 3))]
         for surface in self._surfaces:
             distance, normal = surface.distances_at(points, True)

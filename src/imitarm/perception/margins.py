@@ -1,4 +1,4 @@
-"""CoverageMargin: how far a predicted obstacle may be from the truth, calibrated by its measured coverage."""
+"""CoverageMargin: a bound on the error of a predicted obstacle's position, calibrated with measured errors."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class CoverageMargin:
-    """A distance ``m(tau) = a + b tau`` that bounds the error of a prediction by ``tau`` with a given probability.
+    """A margin ``m(tau) = a + b tau`` that bounds the error of a prediction over ``tau`` [s] with a given probability.
 
-    The margin is added to the required clearance of an obstacle that is predicted ``tau`` seconds ahead. It is
-    calibrated by split conformal prediction. One *window* is one prediction and the true motion that followed it, with
-    the error ``e(tau_k)`` at several look-ahead times. One score is computed for each window::
+    The margin is added to the required clearance of an obstacle that is predicted ``tau`` seconds ahead. The margin is
+    calibrated by split conformal prediction. A *window* consists of one prediction and the true motion after the
+    prediction; its error at the look-ahead time ``tau_k`` is ``e(tau_k)``. One score is computed for each window::
 
         s = max_k e(tau_k) / (a0 + b0 tau_k)
 
     With n independent windows and the coverage ``1 - alpha``, the margin is ``s* (a0 + b0 tau)``, where ``s*`` is the
-    ``ceil((n + 1) (1 - alpha))``-th smallest score. The error of a new window then stays below the margin at all
-    look-ahead times together with a probability of at least ``1 - alpha``, whatever the distribution of the errors, if
-    the new window and those of the calibration are exchangeable. Among several obstacles, ``alpha`` is divided by their
-    number, so that the coverage holds for all of them together.
+    ``ceil((n + 1) (1 - alpha))``-th smallest score. Then the error of a new window stays below the margin at all
+    look-ahead times with a probability of at least ``1 - alpha``. This holds for any distribution of the errors, if the
+    new window and the calibration windows are exchangeable. With several obstacles, ``alpha`` is divided by their
+    number, so that the coverage holds for all obstacles together.
 
     Attributes:
-        offset: ``a``: margin at the time of the prediction [m].
-        growth: ``b``: increase of the margin [m/s].
+        offset: ``a``, margin at the time of the prediction [m].
+        growth: ``b``, increase of the margin per second of look-ahead time [m/s].
 
     Raises:
         InputError: when a number is negative or not finite.
@@ -50,7 +50,7 @@ class CoverageMargin:
 
     @classmethod
     def none(cls) -> CoverageMargin:
-        """Return the margin zero: predictions are taken as exact."""
+        """Return a margin of zero, for predictions that count as exact."""
         return cls(0.0, 0.0)
 
     @property
@@ -65,7 +65,7 @@ class CoverageMargin:
             tau: look-ahead times, shape (...) [s]; times before the prediction count as 0.
 
         Returns:
-            Shape (...) [m].
+            Margins, shape (...) [m].
 
         Raises:
             InputError: when a time is not a finite number.
@@ -83,20 +83,20 @@ class CoverageMargin:
         times: ArrayLike,
         shape: tuple[float, float] | None = None,
     ) -> CoverageMargin:
-        """Return the margin that covers whole windows with the given probability.
+        """Return the margin that bounds the errors of whole windows with the given probability.
 
         Args:
-            windows: prediction errors of independent windows, shape (n_windows, n_times) [m]. Include the error of the
-                fitted shape.
+            windows: prediction errors of independent windows, shape (n_windows, n_times) [m]; they should include the
+                error of the fitted shape.
             coverage: probability that all obstacles stay within their margins, between 0 and 1.
             n_obstacles: number of obstacles present at the same time.
             times: look-ahead times of the errors, shape (n_times,) [s]; at least 0.
-            shape: ``(a0, b0)``, the shape of the margin before it is scaled [m, m/s]. None: it is fitted to a quarter
-                of the windows, which are then left out of the calibration.
+            shape: ``(a0, b0)``, offset and growth of the margin before scaling [m, m/s]. None: both are fitted to a
+                quarter of the windows, which are then left out of the calibration.
 
         Raises:
-            InputError: when a shape is wrong, a number is invalid, or there are too few windows for the coverage. The
-                message states the required number.
+            InputError: when an array has the wrong shape, a number is invalid, or there are too few windows for the
+                coverage. The message states the required number of windows.
         """
         errors, ahead = _checked_windows(windows, times)
         level = finite_number(coverage, "CoverageMargin: coverage", above=0.0)
@@ -111,14 +111,11 @@ class CoverageMargin:
         return cls(scale * a0, scale * b0)
 
     def covered(self, windows: ArrayLike, times: ArrayLike) -> NDArray[np.bool_]:
-        """Return whether the error of each window stays within the margin at all look-ahead times.
+        """Return whether the error of each window stays within the margin at all look-ahead times, shape (n_windows,).
 
         Args:
             windows: prediction errors, shape (n_windows, n_times) [m].
             times: look-ahead times of the errors, shape (n_times,) [s].
-
-        Returns:
-            Shape (n_windows,).
 
         Raises:
             InputError: when a shape is wrong or a number is invalid.
@@ -145,17 +142,17 @@ def conformal_quantile(values: Array, alpha: float) -> float:
     if rank > n:
         needed = math.ceil((1.0 - alpha) / alpha - 1e-9)
         raise InputError(
-            f"CoverageMargin: {n} windows are too few for a miscoverage of {alpha:.3g} per obstacle; at least {needed} "
-            "are needed (and a third more if the shape is fitted too)"
+            f"CoverageMargin: {n} windows are too few for an error probability of {alpha:.3g} per obstacle; at least "
+            f"{needed} are needed (and a third more if the shape is fitted too)"
         )
     return float(np.partition(values, rank - 1)[rank - 1])
 
 
 def fitted_shape(errors: Array, times: Array, alpha: float) -> tuple[float, float]:
-    """Return the line ``a0 + b0 tau`` with ``a0, b0 >= 0`` that follows the quantile ``1 - alpha`` of the errors.
+    """Fit a line ``a0 + b0 tau`` to the errors' ``1 - alpha`` quantile; return ``a0`` and ``b0``, both at least 0.
 
     Args:
-        errors: shape (n_windows, n_times) [m].
+        errors: prediction errors, shape (n_windows, n_times) [m].
         times: look-ahead times, shape (n_times,) [s].
         alpha: fraction of the errors above the quantile.
     """

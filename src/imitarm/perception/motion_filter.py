@@ -1,4 +1,4 @@
-"""MotionFilter: Kalman filters over many obstacles at once, with one or several models of their motion."""
+"""MotionFilter: Kalman filters for many obstacles at once, with one or several models of their motion."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ INITIAL_ACCELERATION = 2.0  # [m/s^2] standard deviation of each component of a 
 
 
 class Belief(NamedTuple):
-    """Gaussian beliefs about n obstacles under M models of motion.
+    """Gaussian estimates of the states of n obstacles, one for each of M models of motion.
 
     The state of an obstacle is ``[p; v]``, or ``[p; v; a]`` if any model has an acceleration.
 
     Attributes:
-        mean: shape (n, M, m) [m, m/s, m/s^2].
-        covariance: shape (n, M, m, m).
+        mean: mean of each state, shape (n, M, m) [m, m/s, m/s^2].
+        covariance: covariance of each state, shape (n, M, m, m).
         weights: probability of each model, shape (n, M).
     """
 
@@ -49,22 +49,22 @@ class Belief(NamedTuple):
     weights: Array
 
     def rows(self, rows: Indices | Sequence[int]) -> Belief:
-        """Return the beliefs about some of the obstacles."""
+        """Return the beliefs about the obstacles with the indices ``rows``."""
         return Belief(self.mean[rows], self.covariance[rows], self.weights[rows])
 
     def replaced(self, rows: Indices, other: Belief) -> Belief:
-        """Return these beliefs with others in some rows."""
+        """Return these beliefs, with the rows ``rows`` replaced by ``other``."""
         copied = Belief(*(x.copy() for x in self))
         for array, new in zip(copied, other, strict=True):
             array[rows] = new
         return copied
 
     def joined(self, other: Belief) -> Belief:
-        """Return these beliefs, followed by others."""
+        """Return these beliefs, followed by the beliefs ``other``."""
         return Belief(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
 
     def combined(self) -> tuple[Array, Array]:
-        """Return mean (n, m) and covariance (n, m, m) over all models (moments of the mixture)."""
+        """Return mean (n, m) and covariance (n, m, m) of the mixture of all models."""
         if self.mean.shape[1] == 1:
             return self.mean[:, 0], self.covariance[:, 0]
         mean = np.einsum("nk,nki->ni", self.weights, self.mean)
@@ -76,12 +76,13 @@ class Belief(NamedTuple):
 class Measurements(NamedTuple):
     """Measured positions of obstacles, one row for each obstacle that was measured.
 
-    A measurement is ``z = h(p) + noise``. ``h`` is the position itself, or, with ``rotations``, the camera's
-    coordinates ``(x/z, y/z, z)`` of the position, of which the extended Kalman filter uses the Jacobian ``H``.
+    A measurement of the position ``p`` is ``h(p) + noise``. Without ``rotations``, ``h(p)`` is ``p`` itself. With
+    ``rotations``, ``h(p)`` contains the camera coordinates ``(x/z, y/z, z)`` of the position; the extended Kalman
+    filter uses the Jacobian ``H`` of ``h``.
 
     Attributes:
         positions: measured positions in the base frame, shape (k, 3) [m].
-        noise: their covariances ``R``, shape (k, 3, 3) [m^2].
+        noise: covariances ``R`` of the measured positions, shape (k, 3, 3) [m^2].
         rotations: base_to_camera rotations, shape (k, 3, 3); None: positions are measured directly. The rotation is nan
             where a position was measured without a camera.
         origins: positions of the cameras, shape (k, 3) [m]; None without cameras.
@@ -93,7 +94,7 @@ class Measurements(NamedTuple):
     origins: Array | None = None
 
     def rows(self, rows: Indices | Sequence[int]) -> Measurements:
-        """Return some of the measurements."""
+        """Return the measurements with the indices ``rows``."""
         if self.rotations is None or self.origins is None:
             return Measurements(self.positions[rows], self.noise[rows])
         return Measurements(self.positions[rows], self.noise[rows], self.rotations[rows], self.origins[rows])
@@ -105,7 +106,8 @@ class Measurements(NamedTuple):
             predicted: predicted positions ``p``, shape (k, ..., 3) [m].
 
         Returns:
-            Innovations (k, ..., 3), Jacobians (k, ..., 3, 3) or None for the unit matrix, noise (k, 1..., 3, 3).
+            Innovations (k, ..., 3); Jacobians (k, ..., 3, 3), or None for the unit matrix; covariances of the noise (k,
+            1..., 3, 3).
         """
         extra = (1,) * (predicted.ndim - 2)
         measured = self.positions.reshape(-1, *extra, 3)
@@ -161,13 +163,13 @@ def inverse_3x3(matrices: Array) -> tuple[Array, Array]:
 
 
 class Innovation(NamedTuple):
-    """Innovations of k measurements and what follows from them.
+    """Innovations of k measurements (measured minus predicted values), and quantities computed from them.
 
     Attributes:
         value: innovation ``nu``, shape (k, ..., 3).
-        jacobian: ``H``, shape (k, ..., 3, 3); None: the unit matrix.
-        noise: ``R`` in the units of the innovation, shape (k, ..., 3, 3).
-        inverse: inverse of the covariance ``S``, shape (k, ..., 3, 3).
+        jacobian: Jacobian ``H`` of the measurement, shape (k, ..., 3, 3); None: the unit matrix.
+        noise: covariance ``R`` of the noise in the units of the innovation, shape (k, ..., 3, 3).
+        inverse: inverse of the innovation's covariance ``S``, shape (k, ..., 3, 3).
         determinant: determinant of ``S``, shape (k, ...).
     """
 
@@ -194,31 +196,33 @@ class Innovation(NamedTuple):
         return np.where(np.isnan(squared), np.inf, squared) if self.jacobian is not None else squared
 
     def rows(self, rows: Indices) -> Innovation:
-        """Return some of the innovations."""
+        """Return the innovations with the indices ``rows``."""
         jacobian = None if self.jacobian is None else self.jacobian[rows]
         return Innovation(self.value[rows], jacobian, self.noise[rows], self.inverse[rows], self.determinant[rows])
 
 
 class MotionFilter:
-    """Kalman filters of all obstacles, computed together: every operation acts on arrays over the obstacles.
+    """Kalman filters of all obstacles, computed together: every operation acts on the arrays of all obstacles.
 
-    A model of order 1 (constant velocity, thesis Eq 5.2 with its noise written as a covariance) has the state ``x = [p;
-    v]``. White noise of spectral density ``q`` [m^2/s^3] disturbs each component of the velocity. Over a time ``dt``::
+    A model of order 1 assumes a constant velocity (thesis Eq 5.2, with the noise written as a covariance). Its state is
+    ``x = [p; v]``. White noise with the spectral density ``q`` [m^2/s^3] disturbs each component of the velocity ``v``.
+    Over a time ``dt``::
 
         F = [I, dt I; 0, I]        Q = q [dt^3/3 I, dt^2/2 I; dt^2/2 I, dt I]
         x <- F x                   P <- F P F' + Q
 
-    In a model of order 2 (constant acceleration) the state also contains the acceleration, which is disturbed by white
-    noise of spectral density ``q`` [m^2/s^5]. A measured position ``z`` with the covariance ``R`` gives, with ``H =
-    [I, 0]``::
+    A model of order 2 assumes a constant acceleration. Its state also contains the acceleration, which white noise with
+    the spectral density ``q`` [m^2/s^5] disturbs. A measured position ``z`` with the covariance ``R`` changes the state
+    as follows, where ``H = [I, 0]``::
 
         S = H P H' + R    K = P H' S^-1    x <- x + K (z - H x)    P <- (I - K H) P (I - K H)' + K R K'
 
-    An interacting multiple model (IMM) runs several models and weights them by the likelihood of the measurements. The
-    models are mixed before each prediction; an obstacle keeps its model for ``DWELL_TIME`` on average.
+    An interacting multiple model (IMM) filter uses several models, and weights the models by the likelihood of the
+    measurements. Before each prediction, the states of the models are mixed, because an obstacle may change its model.
+    The IMM filter assumes that this happens after ``DWELL_TIME`` [s] on average.
 
     Attributes:
-        orders: order of the highest derivative in each model.
+        orders: order of each model, that is, of the highest derivative in its state.
         noise: spectral density ``q`` of each model.
         initial_speed: standard deviation of each component of a new obstacle's velocity [m/s].
         size: length ``m`` of the state.
@@ -298,15 +302,16 @@ class MotionFilter:
         return Belief(mean, covariance, weights)
 
     def update(self, belief: Belief, measured: Measurements, innovation: Innovation | None = None) -> Belief:
-        """Return the beliefs after one measurement of each obstacle.
+        """Return the beliefs after each obstacle has been measured once.
 
         The matrices with 3 rows or columns are padded to the size of the state, because products of small contiguous
         square matrices are faster than products of parts of larger ones.
 
         Args:
-            belief: k beliefs.
-            measured: k measurements.
-            innovation: their innovations with the combined moments, if known; used if there is one model.
+            belief: beliefs about k obstacles.
+            measured: k measurements, one of each obstacle.
+            innovation: innovations of these measurements, if already computed from the combined mean and covariance.
+                They are used only if there is one model.
         """
         mean, P, weights = belief
         if innovation is None or len(self.orders) > 1:

@@ -1,4 +1,4 @@
-"""ObstacleDetector: from one depth image or point cloud to the obstacles in it."""
+"""ObstacleDetector: detects obstacles in one depth image or point cloud."""
 
 from __future__ import annotations
 
@@ -67,32 +67,37 @@ class ObstacleDetector:
     1. Remove points out of the camera's range and mixed pixels at edges (:func:`segmentation.mixed_pixels`).
     2. Remove points outside of the workspace, on the known surfaces (table, floor, pedestal) and on the robot
        (:class:`SelfFilter`).
-    3. Group the rest: points that are connected by small gaps belong to one object. A clearly concave group is cut into
-       two objects that touch each other, for example a hand and a bottle (:func:`segmentation.best_cut`).
-    4. Fit a sphere, a cylinder, a capsule, a box or a convex hull to each object, with the covariance of its position,
-       and extend it to what is hidden (:func:`~imitarm.perception.shape_choice.fit_shape`).
+    3. Group the remaining points: points that are separated only by small gaps belong to one object. A clearly concave
+       group is cut into two objects that touch each other, for example a hand and a bottle
+       (:func:`segmentation.best_cut`).
+    4. Fit a sphere, a cylinder, a capsule, a box or a convex hull to each object, and compute the covariance of its
+       position. Extend the shape into space that the camera can't see
+       (:func:`~imitarm.perception.shape_choice.fit_shape`).
 
-    The fitted shapes are conservative: they contain all visible points, up to twice the noise.
+    The fitted shapes are conservative: no visible point is outside of its shape by more than twice the noise.
 
     Args:
-        arm: the arm with its tool, whose points are removed; None: no robot is in view.
-        surfaces: known objects that are not obstacles; the points inside and near them are removed. A ``HalfSpace``
-            for a floor or a table, or any other shape, such as ``Scene.fixtures``.
-        find_table: whether to find the largest horizontal plane in each image and to remove it too.
-        workspace: lowest and highest corner of the box in which obstacles matter, in the base frame, shape (2, 3) [m].
+        arm: arm with its tool; points on both are removed. None: no robot is in view.
+        surfaces: known objects that are not obstacles, for example ``Scene.fixtures``; points inside and near them are
+            removed. Use a ``HalfSpace`` for a floor or a table.
+        find_table: whether to also find the largest horizontal plane in each image and remove its points.
+        workspace: lowest and highest corner of the box in which obstacles are detected, in the base frame, shape (2, 3)
+            [m].
         depth_range: least and largest depth that the camera measures well [m].
-        noise: noise of the camera, which sets the margins; None: that of a Kinect.
-        surface_margin: distance from a surface within which points belong to it, in addition to the noise [m].
-        padding: see :class:`SelfFilter` [m].
-        stamp_uncertainty: see :class:`SelfFilter` [s].
+        noise: noise of the camera, from which margins are computed; None: the noise of a Kinect.
+        surface_margin: points within this distance from a known surface belong to the surface [m]; the noise is added.
+        padding: distance from the arm within which points belong to the arm [m], see :class:`SelfFilter`.
+        stamp_uncertainty: uncertainty of the time stamps [s], see :class:`SelfFilter`.
         voxel: edge length of the voxels in which points are averaged [m].
-        gap: largest gap between two parts of one object [m]; wider where the rays are farther apart.
-        min_points: least number of points of an object; fewer points count as noise.
+        gap: largest gap between two parts of one object [m]; where neighbouring rays are farther apart, larger gaps are
+            allowed.
+        min_points: smallest number of points of an object; a smaller group counts as noise.
         shapes: shapes that may be fitted.
         split: whether clearly concave groups are cut into parts.
-        targets: known objects; a detection that matches one has its name as label. Points of a target's colour form
-            objects of their own, even if they touch others. Without colours in the images, only shapes are compared.
-        max_obstacles: largest number of detections; of more, those that are nearest to the camera are kept.
+        targets: known objects; if a detection matches a target, its label is the target's name. Points of a target's
+            colour form an object of their own, even if they touch another object. If the images have no colours, only
+            shapes are compared.
+        max_obstacles: largest number of detections; if there are more, the detections nearest to the camera are kept.
 
     Raises:
         InputError: when an argument can't be used.
@@ -144,7 +149,7 @@ class ObstacleDetector:
         )
 
     def record(self, stamp: float, q: ArrayLike) -> None:
-        """Remember the joint positions ``q`` (n_joints,) [rad] at ``stamp`` [s], for the images taken around then."""
+        """Store the joint positions ``q`` (n_joints,) [rad] at ``stamp`` [s], for images taken at about this time."""
         if self.self_filter is not None:
             self.self_filter.record(stamp, q)
 
@@ -188,11 +193,11 @@ class ObstacleDetector:
         return self._obstacle_points(frame)[0].points
 
     def camera_error(self, frame: Frame) -> str:
-        """Return a message if the camera is not where the frame says; empty if nothing indicates this.
+        """Return a message if the camera is not at the pose that the frame states; empty if no error is found.
 
-        After somebody has moved a camera, the known surfaces appear at wrong places. Two signs are checked: many rays
-        go through known surfaces, or the plane of a half-space or of the upper face of a box is more than 3 cm or 4
-        degrees away from its place, and hardly any points are at its place.
+        If somebody has moved a camera, the known surfaces appear at wrong places. Either of two signs is enough. First,
+        many rays go through known surfaces. Second, the measured plane of a half-space or of the upper face of a box
+        deviates from its known place by more than 3 cm or 4 degrees, and hardly any points are at the known place.
 
         Args:
             frame: depth image or point cloud.
@@ -237,7 +242,7 @@ class ObstacleDetector:
             return ""
         return (
             f"the surface {surface.name or surface.kind!r} is seen {1e3 * off:.0f} mm and {np.degrees(tilt):.0f} deg "
-            "away from its place; the camera was moved: calibrate it again"
+            "away from its known place; the camera was moved: calibrate the camera again"
         )
 
     def _obstacle_points(self, frame: Frame) -> tuple[_Measured, tuple[Obstacle, ...]]:

@@ -1,4 +1,4 @@
-"""PersonCapsules: the arms of a person as obstacles, so that the camera that teaches also protects."""
+"""PersonCapsules: a person's arms as obstacles; the camera that records a teacher thus also protects the teacher."""
 
 from __future__ import annotations
 
@@ -20,29 +20,30 @@ _SHOULDER, _ELBOW, _WRIST, _HAND, _TIP, _THUMB = range(6)
 
 
 class PersonCapsules:
-    r"""Turns skeletons into detections: each arm is an upper arm, and a forearm with its hand.
+    r"""Converts skeletons to detections: each arm becomes two capsules, an upper arm and a forearm with its hand.
 
-    A capsule around the segment from shoulder to elbow is the upper arm. The other capsule begins at the elbow and ends
-    at the farthest tracked point of the hand; if only the wrist is tracked, it is extended by the length of a hand. Its
-    radius grows until it also contains the wrist, the hand and the thumb of a bent hand, each with half of its
-    thickness.
+    The capsule of the upper arm surrounds the segment from shoulder to elbow. The capsule of the forearm begins at the
+    elbow and ends at the farthest tracked point of the hand; if only the wrist is tracked, this capsule is extended by
+    the length of a hand. If the hand is bent, the radius of this capsule is enlarged until wrist, hand and thumb are
+    inside, each with half of its thickness.
 
     Let :math:`\sigma_a` and :math:`\sigma_b` be the standard deviations of the two ends, which depend on whether the
-    camera tracks or infers the joints. The errors of both ends are similar, because most of them come from the posture
-    of the person. The covariance of the middle is therefore not reduced by the mean of two ends:
+    camera tracks or infers the joints. The errors of the two ends are correlated, because most errors come from the
+    posture of the person. The middle of the capsule is therefore not more accurate than its ends, and its covariance is
 
     .. math:: R = \tfrac12 (\sigma_a^2 + \sigma_b^2)\, I
 
-    A capsule whose ends are lost, or impossibly far apart, is left out; a tracker then predicts it. Each capsule has a
-    label such as ``"person 0 right forearm"``, so that a tracker never confuses two of them.
+    A capsule is left out if an end is lost, or if the ends are farther apart than possible; a tracker then predicts the
+    capsule. Each capsule has a label such as ``"person 0 right forearm"``, so that a tracker never confuses two
+    capsules.
 
     Args:
         sensor_to_base: pose of the skeleton camera; the camera's frame is that of
             :class:`~imitarm.capture.skeleton.Skeleton` (x to the sensor's left, y up, z away from the sensor).
-        sides: arms of the person.
-        upper_arm_radius: [m].
-        forearm_radius: [m].
-        hand_length: from wrist to finger tips [m].
+        sides: sides of the arms to convert, ``"left"`` and ``"right"``.
+        upper_arm_radius: radius of the upper arm's capsule [m].
+        forearm_radius: smallest radius of the forearm's capsule [m].
+        hand_length: distance from wrist to finger tips [m].
         hand_radius: half of the thickness of a hand [m].
         tracked_sigma: standard deviation of a tracked joint [m].
         inferred_sigma: standard deviation of an inferred joint [m].
@@ -127,11 +128,11 @@ class PersonCapsules:
 
 
 def upright_camera(position: ArrayLike, yaw: float = 0.0) -> Pose:
-    """Return ``sensor_to_base`` of a skeleton camera that stands upright and looks along x of the base.
+    """Return the pose ``sensor_to_base`` of an upright skeleton camera that looks along the x-axis of the base.
 
     Args:
         position: position of the camera in the base frame, shape (3,) [m].
-        yaw: rotation of the camera about the vertical [rad]; 0: it looks along x, and pi: against x.
+        yaw: rotation of the camera about the vertical [rad]. With 0, the camera looks along x; with pi, against x.
 
     Raises:
         InputError: when a number is not finite.

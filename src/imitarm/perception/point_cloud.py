@@ -16,13 +16,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PointCloud:
-    """Measured surface points without the order of an image.
+    """Measured surface points that are not arranged in rows and columns as in an image.
 
     Attributes:
         stamp: time at which the points were measured [s].
         measured: points in the sensor's frame, shape (n, 3) [m]; rows that are not finite are removed.
         sensor_to_base: pose of the sensor when the points were measured.
-        spacing: angle between neighbouring rays [rad]; it tells how far apart neighbouring points of a surface are.
+        spacing: angle between neighbouring rays [rad]; times the distance, it gives the spacing of points on a surface.
         colors: red, green and blue of each point, 0 to 1, shape (n, 3); None without colours.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Segmentation: which measured points form one object."""
+"""Segmentation: decide which measured points form one object."""
 
 from __future__ import annotations
 
@@ -23,17 +23,15 @@ _TRIALS = 200  # planes that fit_plane tries
 
 
 def mixed_pixels(depth: Array, jump: float = 0.04) -> Mask:
-    """Return which pixels measure a mixture of two surfaces: they float in the gap between them, on no object.
+    """Return whether each pixel measures a mixture of two surfaces, and thus a depth at which there is no object.
 
     At the edge of an object, part of the light of a pixel comes from the object and part from the background. The depth
-    of such a pixel lies between those of its two neighbours in a row or column, with a jump to each.
+    of such a pixel lies between the depths of its two neighbours in a row or column, and differs from each by more than
+    ``jump``.
 
     Args:
-        depth: shape (height, width) [m]; nan where nothing was measured.
-        jump: smallest difference to each of the two neighbours [m].
-
-    Returns:
-        Shape (height, width).
+        depth: depth image, shape (height, width) [m]; nan where nothing was measured.
+        jump: smallest difference from each of the two neighbours [m].
     """
     mixed = np.zeros(depth.shape, dtype=bool)
     for values, result in ((depth, mixed), (depth.T, mixed.T)):
@@ -54,19 +52,20 @@ def fit_plane(
 ) -> HalfSpace | None:
     """Find the largest plane among points by RANSAC, for example a table whose height is unknown.
 
-    Planes through three random points are tried; the plane with the most points within ``tolerance`` is fitted to
-    these points by least squares.
+    RANSAC tries planes through three random points, and selects the plane with the most points within ``tolerance``.
+    This plane is then fitted to these points by least squares.
 
     Args:
-        points: shape (n, 3) [m].
-        normal: the expected normal, shape (3,), for example up; None: any plane, with the normal's z positive.
+        points: measured points, shape (n, 3) [m].
+        normal: expected normal of the plane, shape (3,), for example straight up; None: any plane, with a normal whose
+            z is positive.
         tolerance: largest distance of a point that belongs to the plane [m].
         max_tilt: largest angle between the plane's normal and ``normal`` [rad].
         least_fraction: smallest fraction of all points that must belong to the plane.
         seed: seed of the random choices.
 
     Returns:
-        Everything below the plane; None when there is no such plane.
+        A half-space with all points below the plane; None when there is no such plane.
 
     Raises:
         InputError: when an argument can't be used.
@@ -105,7 +104,7 @@ def voxels(points: Array, size: float) -> tuple[Indices, int]:
     """Return the voxel of each point (n,), numbered from 0, and the number of voxels that contain points.
 
     Args:
-        points: shape (n, 3) [m].
+        points: measured points, shape (n, 3) [m].
         size: edge length of a voxel [m].
     """
     cells = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
@@ -122,14 +121,14 @@ def voxel_means(values: Array, index: Indices, n: int) -> Array:
 
 
 def connected(points: Array, gaps: Array) -> Indices:
-    """Return the number of the cluster of each point, from 0, shape (n,).
+    """Divide points into clusters; return the index of each point's cluster, counted from 0, shape (n,).
 
-    Two points are neighbours if their distance is at most the larger of their gaps; a cluster is a set of points that
-    are connected by neighbours.
+    Two points are neighbours if their distance is at most the larger of their two gaps. A cluster contains all points
+    that can be reached from each other through neighbours.
 
     Args:
-        points: shape (n, 3) [m].
-        gaps: shape (n,) [m].
+        points: measured points, shape (n, 3) [m].
+        gaps: largest distance to a neighbour, for each point, shape (n,) [m].
     """
     n = len(points)
     if n == 0:
@@ -144,10 +143,10 @@ def connected(points: Array, gaps: Array) -> Indices:
 
 
 def depth_in_hull(points: Array) -> Array:
-    """Return how deep each point is inside the convex hull of all points, shape (n,) [m].
+    """Return the depth of each point inside the convex hull of all points, shape (n,) [m].
 
-    The visible points of a convex object are on its surface, so they are hardly inside of their hull. Points that are
-    deep inside show that the points belong to a concave object, or to two objects that touch.
+    The visible points of a convex object are on the object's surface, so none of them is deep inside the hull. Points
+    deep inside the hull therefore show a concave object, or two objects that touch.
     """
     try:
         equations = Qhull(points).equations
@@ -157,7 +156,7 @@ def depth_in_hull(points: Array) -> Array:
 
 
 def concavity(points: Array) -> float:
-    """Return the depth inside their hull that 90 % of the points do not exceed [m]; 0 for few or flat points."""
+    """Return the 90th percentile of the points' depths inside their hull [m]; 0 for few points or points in a plane."""
     if len(points) < 8:
         return 0.0
     place = 0.9 * (len(points) - 1)
@@ -169,15 +168,16 @@ def concavity(points: Array) -> float:
 def best_cut(points: Array, origin: Array) -> tuple[Mask, float]:
     """Find the plane that cuts a cluster into the two most convex parts.
 
-    Planes perpendicular to the principal axes, to the vertical and to two horizontal directions are tried, at several
-    heights.
+    Planes perpendicular to the principal axes, to the vertical and to two horizontal directions are tried, each at
+    several positions along its normal.
 
     Args:
-        points: shape (n, 3) [m].
+        points: points of the cluster, shape (n, 3) [m].
         origin: position of the camera, shape (3,) [m].
 
     Returns:
-        Which points are on one side (n,), and the mean concavity of the two sides, weighted by their points [m].
+        Whether each point is on the first side of the plane, shape (n,); and the mean concavity of the two sides,
+        weighted by their numbers of points [m].
     """
     sample = points[np.linspace(0, len(points) - 1, min(len(points), _SEARCHED)).astype(int)]
     center = sample.mean(axis=0)

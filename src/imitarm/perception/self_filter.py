@@ -1,4 +1,4 @@
-"""SelfFilter: which measured points belong to the robot itself."""
+"""SelfFilter: finds the measured points that belong to the robot itself."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ Array = NDArray[np.float64]
 
 
 class SelfFilter:
-    r"""Finds the points that lie on the arm or its tool, so that a robot doesn't avoid itself.
+    r"""Finds the measured points on the arm or its tool, so that a robot doesn't avoid itself.
 
-    Spheres cover the arm (``ArmModel.collision_spheres``). Let ``c`` and ``r`` be the centre and the radius of a sphere
-    at the posture that the arm had when the points were measured, and ``v`` the velocity of its centre. The point
-    ``p`` belongs to the arm if, for any sphere,
+    Spheres cover the arm (``ArmModel.collision_spheres``). At the time at which the points were measured, let ``c`` be
+    the centre of a sphere, ``r`` its radius, and ``v`` the velocity of its centre. The point ``p`` belongs to the arm
+    if, for any sphere,
 
     .. math:: |p - c| \le r + d + |v|\,\delta
 
-    The padding :math:`d` covers errors of the calibration and of the measurement, and :math:`\delta` is the uncertainty
-    of the time stamps: at a joint speed that moves a link by 1 m/s, a stamp that is off by 33 ms shifts the link by
-    33 mm. The posture is interpolated between the recorded joint positions. The filter removes an obstacle too while it
-    is nearer to the arm than the padding, so the padding is kept small.
+    The padding :math:`d` covers errors of the calibration and of the measurement. The uncertainty of the time stamps is
+    :math:`\delta`: if a stamp is wrong by 33 ms, a link that moves at 1 m/s is displaced by 33 mm. The joint positions
+    are interpolated between the recorded values. The filter also removes points of an obstacle that is closer to the
+    arm than the padding, so the padding should be small.
 
     Args:
-        arm: the arm with its tool.
-        padding: ``d`` [m].
-        stamp_uncertainty: ``delta`` [s].
+        arm: arm with its tool.
+        padding: padding ``d`` of each sphere [m].
+        stamp_uncertainty: uncertainty ``delta`` of the time stamps [s].
         history: time for which recorded joint positions are kept [s].
 
     Raises:
@@ -50,9 +50,9 @@ class SelfFilter:
         self._postures: dict[float, Array] = {}
 
     def record(self, stamp: float, q: ArrayLike) -> None:
-        """Remember where the arm was.
+        """Store the joint positions of the arm at one time.
 
-        Joint positions may arrive in any order; a second posture with the same stamp replaces the first.
+        Joint positions may arrive in any order. If two have the same stamp, the second replaces the first.
 
         Args:
             stamp: time of the joint positions [s].
@@ -80,12 +80,10 @@ class SelfFilter:
         return bool(self._stamps)
 
     def posture(self, time: float) -> Array:
-        """Return the joint positions at ``time`` [s], interpolated; the nearest recorded ones outside of the history.
+        """Return the joint positions at ``time`` [s], interpolated between recorded positions, shape (n_joints,) [rad].
 
-        Just after the last record, the joints are assumed to keep their velocity for ``stamp_uncertainty``.
-
-        Returns:
-            Shape (n_joints,) [rad].
+        Before the first record, the first joint positions are returned. After the last record, the joints are assumed
+        to keep their velocity for up to ``stamp_uncertainty``, and then to stand still.
         """
         stamps = self._stamps
         if not stamps:
@@ -112,11 +110,11 @@ class SelfFilter:
         return centers, np.concatenate([padded, cover.base_radii + self.padding])
 
     def on_arm(self, points: Array, time: float, margin: Array | float = 0.0) -> NDArray[np.bool_]:
-        """Return which points belong to the arm, shape (n,).
+        """Return whether each point belongs to the arm, shape (n,).
 
         Args:
             points: points in the base frame, shape (n, 3) [m].
-            time: time at which they were measured [s].
+            time: time at which the points were measured [s].
             margin: additional padding of each point, for example for its noise, shape (n,) or a number [m].
         """
         found = np.zeros(len(points), dtype=bool)

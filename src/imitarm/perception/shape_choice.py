@@ -1,4 +1,4 @@
-"""Choice of the shape that explains the visible points of an object and covers what the camera can't see."""
+"""Chooses a shape that fits the visible points of an object, and extends it over parts that the camera can't see."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _MOST_GROWN = 0.3  # [m] by which an unseen side is extended at most
 def fit_shape(
     visible: Visible, space: FreeSpace, shapes: Sequence[str] = SHAPES, every: Array | None = None
 ) -> Detection:
-    r"""Fit all shapes and return the one that explains the points best, extended to what may be hidden.
+    r"""Fit shapes of all kinds, choose the best shape, and extend it to parts that may be hidden.
 
     Let ``s`` be the root mean square of the distances of ``n`` points to the surface of a fitted shape with ``k``
     parameters, but at least the standard deviation of the measurement. The shape with the smallest Bayesian information
@@ -40,24 +40,26 @@ def fit_shape(
 
     .. math:: n \log s^2 + k \log n
 
-    A shape is left out if more than a quarter of its surface would stand where the camera saw nothing. If every shape
-    is left out, or the best leaves distances far above the noise, the hull of the points is used. A radius is enlarged
-    by its standard deviation, and by up to three if the object is seen to be wider.
+    A shape is rejected if more than a quarter of its surface lies in space that the camera saw to be empty. If every
+    shape is rejected, or if the distances to the best shape are far above the noise, the convex hull of the points is
+    used. A radius is enlarged by its standard deviation, or by up to three standard deviations if the object appears
+    wider in the image.
 
-    Then, ends and faces that the camera did not see grow until they reach space that is seen to be empty, at most by
-    the size of the visible part or 0.3 m. At last, the shape grows until it contains every visible point, up to twice
-    the standard deviation of the noise.
+    Then the shape is extended at the ends and faces that the camera did not see, until it reaches empty space. The
+    extension is at most the size of the visible part, and at most 0.3 m. Finally, the shape is enlarged until no
+    visible point is outside by more than twice the standard deviation of the noise.
 
-    The covariance of the position contains the noise of the points, the distance between neighbouring rays, a twentieth
-    of the size because no object has exactly the fitted shape, and the uncertain size of the unseen part: a side that
-    was extended by ``g`` may end anywhere before, which moves the true centre by up to ``g / 2``, and by ``g /
-    sqrt(12)`` in the root mean square.
+    The covariance of the position is a sum of four terms. The first two result from the noise of the points and from
+    the distance between neighbouring rays. The third is a twentieth of the size, because no object has exactly the
+    fitted shape. The fourth results from the unknown size of the hidden part: a side that was extended by ``g`` may in
+    truth end anywhere in the extension. The true centre may therefore be displaced by up to ``g / 2``, which adds
+    ``g / sqrt(12)`` to the standard deviation.
 
     Args:
         visible: points to which the shapes are fitted.
         space: the space that the camera saw to be empty.
-        shapes: shapes that may be chosen.
-        every: all points of the object, which the result contains, shape (m, 3) [m]; None: ``visible.points``.
+        shapes: kinds of shapes that may be chosen.
+        every: all points that the returned shape must contain, shape (m, 3) [m]; None: ``visible.points``.
     """
     every = visible.points if every is None else every
     n = len(visible.points)
@@ -93,7 +95,7 @@ def fit_shape(
 
 
 def candidates(visible: Visible, kind: str) -> list[Fit]:
-    """Return fits of one kind of shape, one for each direction that its axis may have."""
+    """Return the fits of one kind of shape, one fit for each possible direction of its axis."""
     if kind == "sphere":
         fit = shape_fit.sphere(visible)
         return [] if fit is None else [fit]
@@ -104,7 +106,7 @@ def candidates(visible: Visible, kind: str) -> list[Fit]:
 
 
 def axes(visible: Visible) -> list[Array]:
-    """Return directions that the axis of a cylinder or a capsule may have: across all normals, long, and upright."""
+    """Return possible axes of a cylinder or capsule: perpendicular to all normals, along the longest side, vertical."""
     normals, points = visible.normals, visible.points - visible.points.mean(axis=0)
     least = np.linalg.eigh(normals.T @ normals)[1][:, 0]
     longest = np.linalg.eigh(points.T @ points)[1][:, 2]
@@ -112,7 +114,7 @@ def axes(visible: Visible) -> list[Array]:
 
 
 def box_axes(visible: Visible) -> list[Array]:
-    """Return directions that an edge of a box may have: the normal that most points share, and upright."""
+    """Return possible directions of a box's edge: the most frequent normal of the points, and the vertical."""
     normals = visible.normals[:: max(1, len(visible.normals) // 100)]
     alike = np.abs(normals @ normals.T) > 0.97
     common = alike[int(alike.sum(axis=1).argmax())]
@@ -167,15 +169,15 @@ def _floating(obstacle: Obstacle, visible: Visible, space: FreeSpace) -> float:
 
 
 def grow(obstacle: Obstacle, visible: Visible, space: FreeSpace) -> tuple[Obstacle, Array]:
-    """Extend the faces or ends of a shape until they reach space that is seen to be empty.
+    """Extend the unseen faces or ends of a shape until they reach space that the camera saw to be empty.
 
     Args:
         obstacle: a fitted shape.
-        visible: the points to which it was fitted.
-        space: the space that the camera saw.
+        visible: the points to which the shape was fitted.
+        space: the space that the camera saw to be empty.
 
     Returns:
-        The extended shape, and the covariance of its position that results from the unknown size (3, 3) [m^2].
+        The extended shape; and the covariance of its position that results from the unknown size, shape (3, 3) [m^2].
     """
     if isinstance(obstacle, Box):
         return _grow_box(obstacle, visible, space)
@@ -248,7 +250,7 @@ def _until_empty(samples: Array, lengths: Array, space: FreeSpace, visible: Visi
 
 
 def contain(obstacle: Obstacle, points: Array, tolerance: float = 0.0) -> Obstacle:
-    """Return the shape enlarged so that it contains all points (n, 3) [m], except for ``tolerance`` [m]."""
+    """Enlarge a shape until no point of ``points`` (n, 3) [m] is outside by more than ``tolerance`` [m]."""
     slack = 1e-9
     if isinstance(obstacle, Sphere | Capsule):
         outside = float(obstacle.distances_at(points, False)[0].max()) - tolerance

@@ -30,11 +30,11 @@ class Visible(NamedTuple):
     """The visible points of one object.
 
     Attributes:
-        points: shape (n, 3) [m].
-        normals: outward unit normals, towards the camera, shape (n, 3).
+        points: visible points, shape (n, 3) [m].
+        normals: outward unit normals of the surface, which point towards the camera, shape (n, 3).
         origin: position of the camera, shape (3,) [m].
         sigma: standard deviation of the points along their rays [m].
-        spacing: distance of neighbouring points on a surface that faces the camera [m].
+        spacing: distance between neighbouring points on a surface that faces the camera [m].
     """
 
     points: Array
@@ -45,7 +45,7 @@ class Visible(NamedTuple):
 
     @classmethod
     def of(cls, points: Array, origin: Array, sigma: float, spacing: float) -> Visible:
-        """Estimate the normals and return the points with them."""
+        """Estimate the normals, and return the points together with the normals."""
         return cls(points, point_normals(points, origin), origin, sigma, spacing)
 
 
@@ -53,11 +53,12 @@ class Fit(NamedTuple):
     """A shape fitted to visible points.
 
     Attributes:
-        obstacle: the shape.
-        covariance: covariance of its position for residuals of one metre: the block of ``(J^T J)^-1``, shape (3, 3);
-            for a hull, the covariance itself [m^2].
-        radius: standard deviation of its radius for residuals of one metre; 0 for shapes without a radius.
-        outline: half of the width in which the object is seen [m]; 0 for shapes without a radius.
+        obstacle: the fitted shape.
+        covariance: covariance of the position if the residuals were one metre, shape (3, 3): the block of
+            ``(J^T J)^-1`` that belongs to the position, with the Jacobian J of the residuals. For a hull, the
+            covariance itself [m^2].
+        radius: standard deviation of the radius if the residuals were one metre; 0 for shapes without a radius.
+        outline: half of the object's width as the camera sees it [m]; 0 for shapes without a radius.
     """
 
     obstacle: Obstacle
@@ -67,12 +68,12 @@ class Fit(NamedTuple):
 
 
 def point_normals(points: Array, origin: Array) -> Array:
-    """Return the normal of the surface at each point, towards the camera, shape (n, 3).
+    """Estimate the unit normal of the surface at each point, directed towards the camera, shape (n, 3).
 
-    The normal is the direction in which a point and its nearest neighbours vary least.
+    The normal is the direction along which the positions of a point and its nearest neighbours vary least.
 
     Args:
-        points: shape (n, 3) [m].
+        points: measured points, shape (n, 3) [m].
         origin: position of the camera, shape (3,) [m].
     """
     k = min(_NEIGHBOURS, len(points))
@@ -85,7 +86,7 @@ def point_normals(points: Array, origin: Array) -> Array:
 
 
 def sphere(visible: Visible) -> Fit | None:
-    """Fit a sphere: minimise the squares of ``|p - c| - r`` by Gauss-Newton, from the linear solution."""
+    """Fit a sphere (centre ``c``, radius ``r``): minimise the squares of ``|p - c| - r`` over all points ``p``."""
     points = visible.points
     shift = points.mean(axis=0)
     p = points - shift
@@ -110,8 +111,9 @@ def sphere(visible: Visible) -> Fit | None:
 def cylinders(visible: Visible, axes: Array) -> list[Fit]:
     """Fit cylinders, starting from several directions ``axes`` (k, 3) of the axis.
 
-    Points whose normals are across the axis are on the side; they determine axis and radius. The ends are the planes
-    of points whose normals are along the axis, or the outermost points.
+    A point whose normal is perpendicular to the axis lies on the curved side; these points determine axis and radius. A
+    point whose normal is parallel to the axis lies on a flat end. If there are no such points, the outermost points
+    determine the end.
     """
     bars = _round_bars(visible, axes, np.abs(axes @ visible.normals.T) < 0.6)
     fits = []
@@ -134,8 +136,8 @@ def cylinders(visible: Visible, axes: Array) -> list[Fit]:
 def capsules(visible: Visible, axes: Array) -> list[Fit]:
     """Fit capsules, starting from several directions ``axes`` (k, 3) of the axis.
 
-    All points are at the distance ``r`` from the segment between the two ends. The Gauss-Newton steps move the axis,
-    the radius and the two ends at once.
+    On a capsule, all points have the distance ``r`` from the segment between the two ends. Each Gauss-Newton step
+    changes the axis, the radius and both ends together.
     """
     bars = _round_bars(visible, axes, np.ones((len(axes), len(visible.points)), dtype=bool), rounds=3)
     usable = [i for i, radius in enumerate(bars.radii.tolist()) if _usable(bars.centers[i], radius)]
@@ -180,8 +182,8 @@ def box(visible: Visible, axis: Array) -> Fit:
     """Fit a box of which one edge is parallel to ``axis`` (3,).
 
     The rotation about the axis minimises the mean distance of the points to the nearest face that the camera can see
-    (*L-shape fitting*: Zhang, Xu, Dong and Dolan, IV 2017). A visible face is the mean of its points; the other faces
-    are at the outermost points.
+    (*L-shape fitting*: Zhang, Xu, Dong and Dolan, IV 2017). The position of a visible face is the mean of its points.
+    The other faces are placed at the outermost points.
     """
     e1, e2 = np.concatenate(basis_across(axis[None]))
     local = np.column_stack([visible.points @ e1, visible.points @ e2, visible.points @ axis])
@@ -208,15 +210,16 @@ def box(visible: Visible, axis: Array) -> Fit:
 
 
 def hull(visible: Visible, unseen: Array | None = None) -> Fit:
-    """Enclose the points and a mirrored copy of them behind the object, as its unseen back.
+    """Fit a convex hull: enclose the points, and a mirrored copy of the points that represents the unseen back.
 
-    The back of a convex object begins where its outline is seen. The points are mirrored in the plane perpendicular to
-    the line of sight behind the farthest points. The result is at least as deep as the object is seen to be narrow, so
-    that a single flat face becomes a solid.
+    The back of a convex object begins at the outline that the camera sees. The points are therefore mirrored in a plane
+    that is perpendicular to the line of sight, just behind the farthest points. The hull is at least as deep as the
+    smallest width of the object in the image, so that even a single flat face becomes a solid.
 
     Args:
-        visible: the points.
-        unseen: more points that the hull contains, for example on the table below the object, shape (m, 3) [m].
+        visible: the visible points of the object.
+        unseen: additional points that the hull must contain, for example on the table below the object, shape (m, 3)
+            [m].
     """
     points = visible.points
     sight = points.mean(axis=0) - visible.origin
@@ -237,8 +240,9 @@ def hull(visible: Visible, unseen: Array | None = None) -> Fit:
 def centered_hull(points: Array) -> ConvexHull:
     """Return the hull of points (n, 3) [m]; the origin of its local frame is near the centroid of its volume.
 
-    The local frame of a hull is at the mean of its points, which depends on how densely each side was seen. The corners
-    alone, with as many copies of an inner point, move it to the middle.
+    The class ConvexHull places the local frame at the mean of the given points. The mean of all measured points would
+    depend on how densely the camera sampled each side. Therefore only the corners of the hull are given, together with
+    as many copies of a point in the middle.
     """
     corners = ConvexHull(points).vertices
     center = 0.5 * (corners.min(axis=0) + corners.max(axis=0))

@@ -1,4 +1,4 @@
-"""Target: how a known object is recognised among the obstacles, by its colour, its shape, or both."""
+"""Target: a known object that is recognised among the obstacles by its colour, its shape, or both."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ _BRIGHTNESS = 0.45  # largest difference of the mean of the three colours
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A known object: its name becomes the ``label`` of the detections that match.
+    """A known object; the ``label`` of each matching detection becomes the name of the object.
 
-    A colour matches if its chromaticity, which is red, green and blue divided by their sum, is near that of the target.
-    Chromaticity depends little on the brightness of the light. A shape matches if it is of the same kind and no length
-    differs by more than ``size_tolerance``.
+    The chromaticity of a colour consists of red, green and blue, each divided by their sum. It depends little on the
+    brightness of the light. A colour matches if its chromaticity is close to the chromaticity of the target. A shape
+    matches if it is of the same kind as the target's shape, and no length differs by more than ``size_tolerance``.
 
     Attributes:
-        name: label of the detections.
-        color: red, green and blue, 0 to 1, shape (3,); None: any colour.
-        shape: shape and size, at any pose; None: any shape.
-        color_tolerance: largest distance of two chromaticities.
-        size_tolerance: largest difference of a length [m].
+        name: name of the object, which becomes the label of matching detections.
+        color: red, green and blue of the object, 0 to 1, shape (3,); None: any colour matches.
+        shape: obstacle with the shape and size of the object, at any pose; None: any shape matches.
+        color_tolerance: largest distance between two chromaticities that match.
+        size_tolerance: largest difference between two lengths that match [m].
 
     Raises:
         InputError: when neither colour nor shape is given, or a value can't be used.

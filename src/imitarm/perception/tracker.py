@@ -1,4 +1,4 @@
-"""ObstacleTracker: positions and velocities of moving obstacles, estimated from noisy and late detections."""
+"""ObstacleTracker: estimates positions and velocities of moving obstacles from noisy and late detections."""
 
 from __future__ import annotations
 
@@ -38,46 +38,51 @@ class _Step(NamedTuple):
 
 
 class ObstacleTracker:
-    """Tracks many obstacles with Kalman filters: from stamped detections to positions, velocities and uncertainties.
+    """Tracks many obstacles with Kalman filters: computes positions, velocities and covariances from detections.
 
-    The motion is predicted with thesis Eq 5.2, without its unknown input ``B u`` and with the noise as a covariance;
-    :class:`~imitarm.perception.motion_filter.MotionFilter` has the equations. Every time step is the difference of two
-    time stamps.
+    The motion is predicted with thesis Eq 5.2, without the unknown input ``B u`` and with the noise as a covariance.
+    :class:`~imitarm.perception.motion_filter.MotionFilter` lists the equations. Each time step is the difference
+    between two time stamps.
 
-    1. *Assignment.* A detection and a track can belong together if the normalised innovation squared ``d^2 = nu' S^-1
-       nu`` is within the ``gate`` quantile of the chi-square distribution. Confirmed tracks choose first.
-    2. *Birth.* Every other detection starts a track. It is confirmed when ``confirm[0]`` of its first ``confirm[1]``
-       updates had a detection; until then, the track is not reported.
-    3. *Death.* A track without a detection continues with its velocity, and its covariance grows. It ends when it was
-       not seen for more than ``max_unseen`` seconds.
-    4. *Latency.* ``scene(time)`` predicts all tracks from the time of the last detections to ``time``; this
-       prediction compensates the latency of the sensor (thesis Eqs 5.3 and 5.4: the predicted positions with their
+    1. *Assignment.* The innovation ``nu`` is the measured minus the predicted position, with the covariance ``S``. A
+       detection can belong to a track if ``d^2 = nu' S^-1 nu`` is at most the ``gate`` quantile of the chi-square
+       distribution. Detections are assigned to confirmed tracks first.
+    2. *Birth.* Every detection that was not assigned starts a new track. The track is confirmed if at least
+       ``confirm[0]`` of its first ``confirm[1]`` updates had a detection. Until then, the track is not reported.
+    3. *Death.* A track without a detection continues at its velocity, and its covariance grows. The track ends when it
+       has had no detection for more than ``max_unseen`` seconds.
+    4. *Latency.* ``scene(time)`` predicts all tracks from the time of the last detections to ``time``. This prediction
+       compensates the latency of the sensor (thesis Eqs 5.3 and 5.4 give the predicted positions and their
        covariances).
 
-    **Late detections.** Detections may arrive out of order. An update that is late by at most ``history`` seconds is
-    inserted at its own time, and all later updates are repeated; the result is the same as if all had arrived in order.
-    An older update is ignored. :attr:`ignored` counts it as ``"late"``.
+    **Late detections.** Detections may arrive out of order. If an update is late by at most ``history`` seconds, it is
+    inserted at its own time, and all later updates are computed again. The result is therefore the same as if all
+    updates had arrived in order. An update that is later than this is ignored, and :attr:`ignored` counts it as
+    ``"late"``.
 
-    **Other imperfect input.** A second update with the same stamp and the same detections is ignored
-    (``"repeated"``). Two detections of one update that are not significantly apart, one inside the other, are one
-    obstacle: the more accurate one is kept (``"duplicate"``). A detection that jumps out of the gate starts a new
-    track. If there are more than ``max_obstacles`` tracks, those that were not seen for longest are removed
-    (``"removed"``); more detections than ``max_obstacles`` in one update are an error, and nothing changes.
+    **Other imperfect input.** :attr:`ignored` also counts three other cases. A second update with the same stamp and
+    the same detections is ignored (``"repeated"``). If two detections of one update differ insignificantly and one is
+    inside the other, they count as one obstacle, and only the more accurate detection is used (``"duplicate"``). If
+    there are more than ``max_obstacles`` tracks, the tracks with the oldest detections are removed (``"removed"``). A
+    detection that jumps out of the gate starts a new track. More than ``max_obstacles`` detections in one update are an
+    error, and no track changes.
 
-    **Consistency.** :attr:`consistency` compares the innovations with their covariance. If the mean is above
-    its band, the detections are noisier than their covariance says, or ``process_noise`` is too small.
+    **Consistency.** :attr:`consistency` compares the innovations with their covariance. If the mean is above the band,
+    the detections are noisier than their covariance states, or ``process_noise`` is too small.
 
     Rotations are not estimated: a track has the rotation of its last detection and no angular velocity. Sizes are
     averaged over the detections.
 
     Args:
-        motion: model of the motion: ``"constant-velocity"``, ``"constant-acceleration"``, ``"imm"`` (both, weighted by
-            their likelihoods) or ``"ekf"``. The last one uses constant velocity and measures in the coordinates of the
-            camera (:attr:`Detection.camera_to_base`).
-        process_noise: spectral density of the noise that changes the velocity [m^2/s^3] or, with constant acceleration,
-            the acceleration [m^2/s^5]; two numbers for ``"imm"``. None: 0.05; 1; (0.02, 1).
-        gate: probability that a correct detection is within the gate.
-        confirm: (hits, updates) that confirm a track.
+        motion: model of the motion: ``"constant-velocity"``, ``"constant-acceleration"``, ``"imm"`` (both models,
+            weighted by their likelihoods) or ``"ekf"``. With ``"ekf"``, the velocity is constant, and positions are
+            measured in the coordinates of the camera (:attr:`Detection.camera_to_base`).
+        process_noise: spectral density of the noise that disturbs the velocity [m^2/s^3] or, with constant
+            acceleration, the acceleration [m^2/s^5]; two numbers for ``"imm"``. None: 0.05 for constant velocity, 1 for
+            constant acceleration, (0.02, 1) for ``"imm"``.
+        gate: probability that a detection of the tracked obstacle is within the gate.
+        confirm: (hits, updates): a track is confirmed after this number of hits in its first updates; a hit is an
+            update with a detection.
         max_unseen: time after the last detection at which a track ends [s].
         max_speed: largest speed of an obstacle [m/s]; a larger estimate is scaled down.
         max_obstacles: largest number of tracks, and of detections in one update.
@@ -115,7 +120,7 @@ class ObstacleTracker:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all tracks and counts; track numbers start from 0 again."""
+        """Delete all tracks and counts; track numbers start from 0 again."""
         self.ignored: Counter[str] = Counter()
         self._steps: deque[_Step] = deque()
         self._distances: deque[Array] = deque(maxlen=_RECENT)
@@ -124,12 +129,12 @@ class ObstacleTracker:
 
     @property
     def stamp(self) -> float | None:
-        """Time of the newest accepted update [s]; None before the first one."""
+        """Time of the newest accepted update [s]; None before the first update."""
         return self._steps[-1].stamp if self._steps else None
 
     @property
     def tracks(self) -> tuple[TrackedObstacle, ...]:
-        """The confirmed tracks at :attr:`stamp`, in the order of their numbers."""
+        """The confirmed tracks at the time :attr:`stamp`, in the order of their numbers."""
         return self._steps[-1].tracks.view if self._steps else ()
 
     @property
@@ -144,7 +149,7 @@ class ObstacleTracker:
         return Consistency.of(values, gate=self.gate)
 
     def update(self, stamp: float, detections: Sequence[Detection]) -> tuple[TrackedObstacle, ...]:
-        """Take in what one sensor measured at one time.
+        """Update the tracks with the detections of one sensor at one time.
 
         Args:
             stamp: time of the measurement [s].
@@ -154,15 +159,16 @@ class ObstacleTracker:
             The confirmed tracks at the newest stamp, in the order of their numbers.
 
         Raises:
-            InputError: when ``stamp`` is not a finite number or more than 10 s before the newest one, an entry of
-                ``detections`` is not a detection, or there are more than ``max_obstacles``. The tracks are not changed.
+            InputError: when ``stamp`` is not a finite number or more than 10 s before the newest stamp, an entry of
+                ``detections`` is not a detection, or there are more than ``max_obstacles`` detections. The tracks are
+                then not changed.
         """
         stamp = finite_number(stamp, "ObstacleTracker.update: stamp", "s")
         found = sequence(detections, Detection, "ObstacleTracker.update: detections")
         if len(found) > self.max_obstacles:
             raise InputError(
                 f"ObstacleTracker.update: {len(found)} detections are more than max_obstacles = {self.max_obstacles}; "
-                "raise max_obstacles, or leave out detections out of reach"
+                "increase max_obstacles, or leave out detections that are out of reach"
             )
         if self._steps and stamp < self._steps[-1].stamp:
             self._insert(stamp, found)
@@ -173,16 +179,16 @@ class ObstacleTracker:
         return self.tracks
 
     def scene(self, time: float, *, goal: Pose | None = None, fixtures: Sequence[Obstacle] = ()) -> Scene:
-        """Return the confirmed tracks predicted for ``time`` as the obstacles of a scene.
+        """Return a scene whose obstacles are the confirmed tracks, predicted to ``time``.
 
         Each obstacle has the predicted position and velocity, the covariance of this position at ``time``, and the
-        number of its track. ``packed.stamps`` has the time at which each obstacle was last seen. A track stays in the
-        scene until an update ends it: without updates, obstacles do not disappear.
+        number of its track. ``packed.stamps`` contains the time of the last detection of each obstacle. A track stays
+        in the scene until an update ends the track, so obstacles do not disappear while no updates arrive.
 
         Args:
-            time: time for which the obstacles are predicted [s]; the stamp of the scene.
+            time: time to which the obstacles are predicted, and stamp of the scene [s].
             goal: goal of the scene.
-            fixtures: fixtures of the scene.
+            fixtures: fixtures (known obstacles that do not move) of the scene.
 
         Raises:
             InputError: when an argument is invalid.
@@ -234,7 +240,7 @@ class ObstacleTracker:
         newest, oldest = self._steps[-1].stamp, self._steps[0].stamp
         if newest - stamp > _RESET:
             raise InputError(
-                f"ObstacleTracker.update: stamp {stamp:.3f} s is {newest - stamp:.1f} s before the newest one "
+                f"ObstacleTracker.update: stamp {stamp:.3f} s is {newest - stamp:.1f} s before the newest stamp "
                 f"({newest:.3f} s); all sensors must use one clock. Call reset() after the clock was set back"
             )
         if stamp < newest - self.history or (stamp < oldest and self._forgotten):

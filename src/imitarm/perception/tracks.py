@@ -1,4 +1,4 @@
-"""Tracks: everything a tracker knows at one time, as arrays; and TrackedObstacle, a view of one of them."""
+"""Tracks: the state of a tracker at one time, as arrays. TrackedObstacle: a view of one track."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ UNCONFIRMED = -1  # the number of a track that is not confirmed yet
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """n tracks at one time, one row each; never changed, but replaced.
+    """The state of n tracks at one time, one row for each track; a Tracks object never changes.
 
     Attributes:
-        filter: the filter of the beliefs.
+        filter: Kalman filters that compute the beliefs.
         stamp: time of the beliefs [s].
-        belief: position, velocity (and acceleration) of each obstacle.
-        ids: number of each track, shape (n,); ``UNCONFIRMED`` until it is confirmed.
+        belief: estimated position, velocity (and acceleration) of each obstacle, with covariances.
+        ids: number of each track, shape (n,); ``UNCONFIRMED`` until the track is confirmed.
         last_seen: time of the last detection of each track, shape (n,) [s].
-        hits: the last updates of each track as bits: 1 for an update with a detection, shape (n,).
-        ages: number of updates of each track, shape (n,).
-        sizes: smoothed size of each shape, shape (n, 3) [m].
-        counts: number of detections of the same kind of shape, shape (n,).
-        detections: last detection of each track, of length n.
-        labels: last label of each track that was not empty, of length n.
+        hits: the last updates of each track as bits of a number, shape (n,); a bit is 1 if the update had a detection.
+        ages: number of updates since the track began, shape (n,).
+        sizes: size of each shape, averaged over detections, shape (n, 3) [m].
+        counts: number of detections over which each size is averaged, shape (n,).
+        detections: last detection of each track, n entries.
+        labels: last label of each track that was not empty, n entries.
         next_id: number of the next track that is confirmed.
     """
 
@@ -54,7 +54,7 @@ class Tracks:
     next_id: int = 0
 
     def changed(self, **changes: object) -> Tracks:
-        """Return a copy with other values of some attributes; faster than :func:`dataclasses.replace`."""
+        """Return a copy with new values for some attributes; faster than :func:`dataclasses.replace`."""
         copied = object.__new__(Tracks)
         values = self.__dict__
         copied.__dict__.update({key: values[key] for key in _ATTRIBUTES}, **changes)
@@ -62,7 +62,7 @@ class Tracks:
 
     @classmethod
     def none(cls, motion_filter: MotionFilter, stamp: float, next_id: int = 0) -> Tracks:
-        """Return no tracks."""
+        """Return an object without tracks."""
         whole = np.zeros(0, dtype=np.int64)
         belief = motion_filter.born(np.zeros((0, 3)), np.zeros((0, 3, 3)))
         sizes = np.zeros((0, 3))
@@ -77,7 +77,7 @@ class Tracks:
         return (self.ids != UNCONFIRMED).nonzero()[0]
 
     def rows(self, rows: Indices) -> Tracks:
-        """Return some of the tracks."""
+        """Return the tracks with the indices ``rows``."""
         chosen = rows.tolist()
         return self.changed(
             belief=self.belief.rows(rows),
@@ -92,7 +92,7 @@ class Tracks:
         )
 
     def joined(self, other: Tracks) -> Tracks:
-        """Return these tracks, followed by others of the same time."""
+        """Return these tracks, followed by the tracks of ``other``, which must have the same stamp."""
         return self.changed(
             belief=self.belief.joined(other.belief),
             ids=np.concatenate([self.ids, other.ids]),
@@ -106,12 +106,12 @@ class Tracks:
         )
 
     def at(self, time: float) -> Tracks:
-        """Return the tracks predicted for another time [s]."""
+        """Return the tracks, predicted to ``time`` [s]."""
         return self.changed(stamp=time, belief=self.filter.predict(self.belief, time - self.stamp))
 
     @cached_property
     def moments(self) -> tuple[Array, Array]:
-        """Mean (n, m) and covariance (n, m, m) of each obstacle's state over all models of motion."""
+        """Mean (n, m) and covariance (n, m, m) of each obstacle's state, combined over all models of motion."""
         return self.belief.combined()
 
     @cached_property
@@ -133,7 +133,7 @@ class TrackedObstacle:
     """The estimate of one obstacle at one time.
 
     Attributes:
-        tracks: all tracks at that time.
+        tracks: all tracks at this time.
         row: index of this track in ``tracks``.
     """
 
@@ -179,8 +179,8 @@ class TrackedObstacle:
     def obstacle(self) -> Obstacle:
         """The obstacle at ``stamp``, with velocity, covariance of the position, track number and name.
 
-        Its size is smoothed over the detections. Its rotation is that of the last detection, and its angular velocity
-        is 0: rotations are not estimated.
+        The size is averaged over the detections. Rotations are not estimated: the rotation is taken from the last
+        detection, and the angular velocity is 0.
         """
         tracks, row = self.tracks, self.row
         shape = tracks.detections[row].obstacle
@@ -223,7 +223,7 @@ class TrackedObstacle:
 
 
 def smoothed_sizes(sizes: Array, rows: Indices, measured: Array, counts: NDArray[np.int64]) -> Array:
-    """Return the sizes (n, 3) after new measurements (k, 3) of the tracks ``rows``, the mean of the last ones."""
+    """Return the averaged sizes (n, 3) [m] of all tracks after new measurements (k, 3) [m] of the tracks ``rows``."""
     error = measured - sizes[rows]
     if not error.any():
         return sizes

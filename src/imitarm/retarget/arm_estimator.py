@@ -31,9 +31,9 @@ class ArmEstimate(NamedTuple):
 
     Attributes:
         time: time of the frame, on the source's clock [s].
-        shoulder: position, shape (3,) [m].
-        elbow: position, shape (3,) [m].
-        wrist: position, shape (3,) [m].
+        shoulder: position of the shoulder, shape (3,) [m].
+        elbow: position of the elbow, shape (3,) [m].
+        wrist: position of the wrist, shape (3,) [m].
         velocities: velocities of shoulder, elbow and wrist, shape (3, 3) [m/s].
         hand: rotation of the hand, quaternion wxyz, shape (4,): x along the hand, z out of the back of the hand.
         angular_velocity: angular velocity of the hand, shape (3,) [rad/s].
@@ -95,7 +95,7 @@ class ArmEstimator:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past."""
+        """Delete everything that was learned from previous frames."""
         self._time = self._used = -np.inf
         self._hand: Array | None = None
         self._fore: Array | None = None

@@ -259,8 +259,8 @@ def suggested_scale(arm: ArmModel, lengths: LimbLengths, anchor: Anchor = "shoul
     r"""Return a suitable scale for this robot and this person (docs/capture.md).
 
     Args:
-        arm: the robot's.
-        lengths: the person's.
+        arm: arm of the robot.
+        lengths: bone lengths of the person's arm.
         anchor: what determines the scale. With ``"shoulder"``, the scale is the ratio of the two arms' reaches,
             :math:`\rho = reach_{robot} / reach_{human}`, so that the person can use the robot's whole workspace. With
             ``"object"``, the scale is 1, because the robot handles objects of the same size as the person's.

@@ -57,7 +57,7 @@ def dh_transform(theta: ArrayLike, d: ArrayLike, a: ArrayLike, alpha: ArrayLike,
             rotational part of the transform is then not a rotation.
 
     Returns:
-        shape (..., 4, 4).
+        Transforms, shape (..., 4, 4).
     """
     theta, d, a, alpha = np.broadcast_arrays(*(np.asarray(x, dtype=float) for x in (theta, d, a, alpha)))
     c, s, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
@@ -81,7 +81,7 @@ def human_arm_frames(angles: ArrayLike, lengths: LimbLengths, *, as_printed: boo
 
     Args:
         angles: joint angles, shape (7,) [rad].
-        lengths: lengths of this person.
+        lengths: bone lengths of the person's arm.
         as_printed: whether to use the matrices as printed in the thesis, whose rotational parts are not rotations.
 
     Returns:
@@ -194,14 +194,14 @@ def _wrapped(angles: Array) -> Array:
 def hand_rotation(wrist: Array, tip: Array, thumb: Array) -> Array | None:
     r"""Return the hand's rotation from wrist, tip and thumb; None when these points do not determine it.
 
-    Shoulder, elbow and wrist alone do not show how the forearm is rotated or how the wrist is bent. With the wrist W
-    and the unit vectors :math:`x = \overline{tip - W}` and :math:`n = \overline{x \times (thumb - W)}`, the rotation
-    matrix is :math:`[x,\; n \times x,\; n]`.
+    Shoulder, elbow and wrist alone do not show how the forearm is rotated or how the wrist is bent. Let W be the wrist,
+    and let a bar denote a vector scaled to length 1. With :math:`x = \overline{tip - W}` and
+    :math:`n = \overline{x \times (thumb - W)}`, the rotation matrix is :math:`[x,\; n \times x,\; n]`.
 
     Args:
         wrist: wrist position, shape (3,) [m].
         tip: position of the hand's tip, shape (3,) [m].
-        thumb: its tip.
+        thumb: position of the thumb's tip, shape (3,) [m].
 
     Returns:
         Rotation matrix, shape (3, 3); None when the angle between hand and thumb is less than 12 degrees, or a point is

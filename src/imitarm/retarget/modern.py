@@ -61,9 +61,10 @@ class ModernRetargeter(Retargeter):
     4. limit the jerk of the joints (:class:`JerkLimiter`) and check all limits again. If something blocks the arm, the
        arm does not push harder, and the target stays near the blocked tool.
 
-    Since the robot began to follow, its desired elbow angle :math:`\psi_d` has changed by as much as the person's elbow
-    angle :math:`\psi_h`, so :math:`\psi_d = \psi_0 + \psi_h - \psi_{h,0}`. The weight of the elbow task decreases when
-    the camera sees the person's elbow poorly, and when the person's or the robot's arm is nearly straight.
+    Let :math:`\psi_0` and :math:`\psi_{h,0}` be the elbow angles of robot and person when the robot began to follow the
+    person. If the person's elbow angle is now :math:`\psi_h`, the desired elbow angle of the robot is
+    :math:`\psi_d = \psi_0 + \psi_h - \psi_{h,0}`. The weight of the elbow task decreases when the camera sees the
+    person's elbow poorly, and when the person's or the robot's arm is nearly straight.
 
     When the camera loses the person, the robot continues along the extrapolated motion for 0.1 s, then holds its
     target, and stops 0.3 s after the loss. Once the person has been seen again for half a second, the motion restarts

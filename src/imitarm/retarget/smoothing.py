@@ -27,7 +27,7 @@ def smoothing_weight(cutoff: Any, period: float) -> Any:
 
     Args:
         cutoff: cut-off frequency f [Hz], a number or an array.
-        period: T [s].
+        period: sampling period T [s].
     """
     angle = (2.0 * math.pi * period) * cutoff
     return angle / (1.0 + angle)
@@ -59,7 +59,7 @@ class OneEuro:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past."""
+        """Delete all previous values."""
         self._time = -math.inf
         self._shape: tuple[int, ...] = ()
         self._last: list[list[float]] = []  # the vectors as measured, smoothed, and their velocities
@@ -72,7 +72,7 @@ class OneEuro:
         """Process measured vectors and return the smoothed vectors, same shape; ``velocity`` is their derivative.
 
         Args:
-            time: time of the measurement [s]; if it is not later than the previous one, the previous result is
+            time: time of the measurement [s]; if it is not later than the previous time, the previous result is
                 returned.
             x: one vector, shape (d,), or several vectors with separate speeds, shape (k, d).
             confidence: confidence from 0 to 1; for several vectors one number or shape (k, 1).
@@ -179,7 +179,7 @@ class Hampel:
     when most values in the window are near the new value.
 
     Args:
-        window: duration [s].
+        window: duration of the sliding window [s].
         least: distance r from the median within which no value is an outlier [m]; it should exceed the distance that a
             fast hand moves within half the window.
     """
@@ -190,7 +190,7 @@ class Hampel:
         self._values: deque[list[float]] = deque()
 
     def reset(self) -> None:
-        """Forget the past."""
+        """Delete all previous values."""
         self._times.clear()
         self._values.clear()
 
@@ -239,8 +239,8 @@ class TrackingOffsets:
     0.2 m.
 
     Args:
-        time: T [s].
-        distance: L [m].
+        time: time constant T with which the offset decays [s].
+        distance: length constant L with which the offset decays as the joint moves [m].
 
     Raises:
         InputError: when an argument is not positive.
@@ -255,7 +255,7 @@ class TrackingOffsets:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past."""
+        """Delete all previous values."""
         self._clock = 0.0
         self._confidence: list[float] = []
         self._measured: list[list[float]] = []

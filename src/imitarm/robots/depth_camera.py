@@ -1,4 +1,4 @@
-"""A simulated depth camera in the world of a simulated robot; it needs neither a display nor OpenGL."""
+"""DepthCamera: a simulated depth camera in the world of a simulated robot, without a display or OpenGL."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ class DepthCamera:
     of the thesis, use ``nearest=0.5, farthest=5.0, noise=DepthNoise()``.
 
     Args:
-        robot: robot; the camera sees the world of this robot, including the arm.
-        intrinsics: the camera.
+        robot: simulated robot; the camera sees the world of this robot, including the arm.
+        intrinsics: intrinsic parameters of the camera.
         pose: camera_to_base for a fixed camera; camera_to_tool for a camera that is mounted on the tool. The
             camera's frame has x to the right of the image, y down and z forward.
         on_tool: whether the camera moves with the tool.
-        nearest: least depth that is measured [m].
+        nearest: smallest depth that is measured [m].
         farthest: largest depth that is measured [m].
-        noise: noise of the depths; None: exact.
+        noise: noise of the depths; None: the depths are exact.
         seed: seed of the noise.
-        color: whether the images have colours, those of the simulated surfaces without light and shade.
+        color: whether the images contain the colours of the simulated surfaces, without light and shade.
 
     Raises:
         InputError: when an argument is of a wrong type, or the range of depths is empty or negative.

@@ -26,10 +26,10 @@ def limit_velocity(
 
     First, all joints are slowed by one factor until none exceeds its maximum velocity, so that the tool keeps its
     direction. Then the velocity of each joint is clipped to the interval that
-    :class:`~imitarm.kinematics.limits.JointLimits` permits. This interval is computed for the position
-    ``q + previous * dt / 2`` instead of ``q``, because :class:`~imitarm.kinematics.limits.JointLimits` assumes that the
-    set-point moves by ``velocity * dt``, whereas with constant acceleration it moves by
-    ``(previous + velocity) / 2 * dt``.
+    :class:`~imitarm.kinematics.limits.JointLimits` permits. :class:`~imitarm.kinematics.limits.JointLimits` assumes
+    that the set-point moves by ``velocity * dt``. With constant acceleration, however, the set-point moves by
+    ``(previous + velocity) / 2 * dt``. The interval is therefore computed for the position ``q + previous * dt / 2``
+    instead of ``q``.
 
     Args:
         limits: limits of the arm.
@@ -130,7 +130,7 @@ class Robot(ABC):
         return state
 
     def grasp(self, opening: float) -> None:
-        """Start to move the gripper's fingers to an opening; they continue to move while the arm moves.
+        """Start to move the gripper's fingers to an opening; the fingers continue to move while the arm moves.
 
         Fingers in contact with an object press with limited force, so ``grasp(0.0)`` grasps an object between them.
 
@@ -155,7 +155,7 @@ class Robot(ABC):
         return float("nan")
 
     def clearance(self) -> float:
-        """Return the distance from arm and tool to the nearest obstacle [m]; nan if the robot does not measure it."""
+        """Return the distance from arm and tool to the nearest obstacle [m]; nan if the robot can't measure it."""
         return float("nan")
 
     def nearest_pair(self) -> tuple[str, str] | None:

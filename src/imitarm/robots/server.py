@@ -64,8 +64,8 @@ class Supervisor:
     the next stop. Any client may stop the robot.
 
     A command is valid if it passes the :class:`~imitarm.transmission.datagram_filter.DatagramFilter`, is for this arm,
-    and is within the joints' position and velocity limits. The command must also be near the set-point: for no joint
-    may the two differ by more than the joint moves in 0.15 s at full speed.
+    and is within the joints' position and velocity limits. The command must also be near the set-point: the difference
+    for each joint is at most the angle by which the joint moves in 0.15 s at full speed.
 
     Let :math:`q_c` be the commanded position and :math:`\dot q_c` its velocity. The set-point q moves towards
     :math:`q_c` at the following velocity:
@@ -88,7 +88,7 @@ class Supervisor:
 
     Attributes:
         robot: the robot.
-        status: see the list of statuses above.
+        status: current status, one of the statuses above.
         reason: why the robot is stopped or faulty.
         challenge: number that ENABLE must currently contain; 0 if the robot is not stopped.
         datagram_filter: checks the owner's commands.

@@ -50,8 +50,9 @@ class SimulatedRobot(Robot):
         model: the compiled world.
         data: state of the simulation; read only.
         scene_at_start: the scene at time 0.
-        contacts: names of the pairs that have touched since the last reset: arm geom and obstacle, arm geom and
-            fixture, or two geoms of different links of the arm (a self-contact).
+        contacts: names of the pairs that have touched since the last reset. A geom is a shape of the simulator. A pair
+            consists of a geom of the arm and an obstacle, a geom of the arm and a fixture, or two geoms of different
+            links of the arm (a self-contact).
         contact_steps: number of physics steps with such a contact.
     """
 
@@ -74,8 +75,8 @@ class SimulatedRobot(Robot):
                 the start time of the world. Without fixtures and ``world``, a floor and a pedestal are added.
             motion: motions of some obstacles, by name or index. Each motion is a function of the time on the scene's
                 clock, or a recorded :class:`~imitarm.scene.motion.Track`. Other obstacles keep their velocities.
-            world: world with the arm, built by :func:`~imitarm.robots.world.arm_world` and possibly extended by
-                furniture; it is copied. None: the world is built from the scene.
+            world: world with the arm, built by :func:`~imitarm.robots.world.arm_world`, to which furniture may have
+                been added; a copy is used. None: the world is built from the scene.
             control: ``"position"`` or ``"torque"``.
             q: start posture, shape (n_joints,) [rad]; None: ``arm.home``.
             timestep: time step of the physics and of the drives [s].
@@ -140,7 +141,7 @@ class SimulatedRobot(Robot):
         """Return the world to time 0, with the arm at rest at ``q``.
 
         Args:
-            q: joint angles, shape (n_joints,) [rad]; None for those given at construction.
+            q: joint angles, shape (n_joints,) [rad]; None: the angles given to the constructor.
 
         Returns:
             The state.
@@ -242,12 +243,12 @@ class SimulatedRobot(Robot):
         """Let a hand guide the arm by its tool for ``dt`` seconds while the drives compensate the arm's weight.
 
         Manufacturers of robot arms call this mode zero gravity or free drive. The drives also compensate most of the
-        dry friction and add a little damping, see :meth:`Drives.free`. Afterwards the set-point is the posture that the
-        arm has reached.
+        dry friction and add a little damping, see :meth:`Drives.free`. Afterwards, the set-point is the posture that
+        the arm has reached.
 
         Args:
             wrench: force [N] then torque [N m] of the hand on the tool's tip, in the base frame, shape (6,).
-            dt: [s].
+            dt: duration [s].
 
         Returns:
             The measured state after ``dt``.
@@ -326,8 +327,8 @@ class Drives:
 
     Args:
         model: the compiled world, with the drives that :func:`add_drives` has added.
-        data: its state.
-        arm: the arm.
+        data: state of this world.
+        arm: arm whose joints are driven.
     """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, arm: ArmModel) -> None:

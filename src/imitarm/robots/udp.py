@@ -27,13 +27,13 @@ _ACTIVE = (RobotStatus.FOLLOWING, RobotStatus.SLOWING)
 
 
 class Echo(NamedTuple):
-    """When one command was sent, received and applied, as reported by the server.
+    """Times at which one command was sent, received and applied, as reported by the server.
 
     Attributes:
         sequence: sequence number of the command.
         sent: time from sending to receiving [s]. If the server is on another machine, the travel time of the fastest
             command is subtracted.
-        applied: time from receiving the command until a set-point computed from it was given to the drives [s].
+        applied: time from receiving the command until the drives received a set-point computed from this command [s].
         applied_ns: time at which this set-point was given to the drives, on the clock of this process [ns]. If the
             server is on another machine, the travel time of the fastest command is assumed to be 0.
     """
@@ -60,7 +60,7 @@ class UdpRobot(Robot):
         address: host and port of the server.
         timeout: longest time to wait for the first answer [s].
         clock_ns: clock for the time stamps [ns].
-        sleep: waits for a time [s].
+        sleep: function that waits for a time [s].
 
     Attributes:
         reported: the newest state that the server has sent.
@@ -163,7 +163,7 @@ class UdpRobot(Robot):
         return float("nan") if self.reported.opening is None else self.reported.opening[1]
 
     def echoes(self) -> list[Echo]:
-        """Return the times of the commands that the server has reported since the last call."""
+        """Return the times of those commands that the server has reported since the last call of this method."""
         echoes, self._echoes = self._echoes, []
         return echoes
 

@@ -32,9 +32,9 @@ def arm_world(
 
     Args:
         arm: the arm with its tool.
-        floor: see :func:`~imitarm.scene.standard_fixtures`.
-        pedestal_radius: see :func:`~imitarm.scene.standard_fixtures`.
-        fixtures: fixtures that replace the standard ones.
+        floor: height of the floor [m], see :func:`~imitarm.scene.standard_fixtures`.
+        pedestal_radius: radius of the pedestal [m], see :func:`~imitarm.scene.standard_fixtures`.
+        fixtures: fixtures (known objects that do not move) that replace the standard fixtures.
 
     Returns:
         A specification that :class:`~imitarm.robots.simulated.SimulatedRobot` takes as ``world``.
@@ -75,12 +75,12 @@ def add_fixtures(spec: mujoco.MjSpec, fixtures: Sequence[Obstacle]) -> None:
 
 
 def fixture_names(fixtures: Sequence[Obstacle]) -> list[str]:
-    """Return the names of the geoms of fixtures in a world."""
+    """Return the names of the geoms that :func:`add_fixtures` creates for ``fixtures``, in the same order."""
     return [fixture.name or f"fixture/{i}" for i, fixture in enumerate(fixtures)]
 
 
 def add_obstacles(spec: mujoco.MjSpec, scene: Scene) -> None:
-    """Add every obstacle of ``scene`` as a solid body; the body follows a given motion, and contacts don't move it.
+    """Add every obstacle of ``scene`` as a solid body; the body follows the obstacle's motion, not contact forces.
 
     Args:
         spec: world; changed in place.
@@ -141,9 +141,9 @@ def _surface(obstacle: Obstacle, n_around: int = 96, n_up: int = 32) -> Array:
 class ClearanceGauge:
     """Measures the smallest distance from an arm to obstacles and finds contacts, using the simulator's geoms.
 
-    Bounding spheres are evaluated first: the distance between centres minus both radii is a lower bound of a pair's
-    distance. Pairs are then measured by ``mj_geomDistance`` in the order of their bounds, until the next bound exceeds
-    the smallest measured distance. Most pairs therefore need no exact measurement.
+    Bounding spheres are evaluated first: the distance between their centres minus both radii is a lower bound for the
+    distance of a pair of geoms. Pairs are then measured by ``mj_geomDistance`` in the order of their bounds, until the
+    next bound exceeds the smallest measured distance. Most pairs therefore need no exact measurement.
 
     Args:
         model: the compiled world.
@@ -184,8 +184,8 @@ class ClearanceGauge:
     def measure(self, data: mujoco.MjData) -> tuple[float, tuple[int, int] | None]:
         """Return the smallest signed distance [m], negative in contact, and the ids of the two geoms.
 
-        For a self-contact, the distance is minus its depth. Without obstacles, or when all are farther than 100 m, the
-        result is inf and None.
+        For a self-contact, the distance is minus the depth of the contact. The result is inf and None without
+        obstacles, or if all obstacles are farther than 100 m.
         """
         smallest, pair = _FAR, None
         for depth, first, second in self._self_contacts(data):

@@ -1,7 +1,7 @@
 """Synthetic teachers: persons with different habits, each of whom demonstrates the same motion several times.
 
-A learned skill contains the habits of its teachers. With one teacher, all of his habits become part of the skill; with
-several teachers, habits that differ cancel each other in the mean.
+A learned skill contains the habits of its teachers. With one teacher, all habits of this teacher become part of the
+skill. With several teachers, different habits partly cancel each other in the mean.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ _WAVES = 4  # of the wobble
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    r"""A motion to demonstrate, as a curve over the progress p from 0 at the start to 1 at the goal.
+    r"""A motion to demonstrate: a curve over the progress p, which is 0 at the start and 1 at the goal.
 
     A demonstration of the motion is the curve
 
     .. math:: x(p) = c(p) + (k - 1 + 0.15\, a)\, b(p) + \sum_{i=1}^2 (o_i + \beta_i)\, s_i(p) + \text{wobble}
 
-    Here, c is the ideal curve, b a bend that a teacher with a curvature k above 1 exaggerates, o the offset of the
-    teacher, and :math:`s_i` the spread between repeats. The random numbers a and :math:`\beta` differ from one repeat
-    to the next.
+    Here, c is the ideal curve, and b a bend of the curve; a teacher with a curvature k above 1 exaggerates this bend.
+    The offset :math:`o_i` belongs to the teacher, and :math:`s_i` is the spread between repeats. The random numbers a
+    and :math:`\beta_i` differ from one repeat to the next. The wobble is a smooth random motion of the hand.
 
     Attributes:
         name: name of the task.
-        curve: ideal positions, shape (n, 3) [m], at progress (n,).
-        bend: displacement by which a bend is exaggerated when k is 2, shape (n, 3) [m], at progress (n,).
-        spread: two displacements of one standard deviation, shape (2, n, 3) [m], at progress (n,); 0 where the motion
-            must be precise.
+        curve: ideal positions c at n evenly spaced values of the progress, shape (n, 3) [m].
+        bend: displacement b by which a teacher with k = 2 exaggerates the bend, at the same values, shape (n, 3) [m].
+        spread: two displacements :math:`s_i` of one standard deviation, at the same values, shape (2, n, 3) [m]; 0
+            where the motion must be precise.
         free: axes along which the hand may wobble (1) or not (0), shape (3,).
-        duration: duration without any habit [s].
+        duration: duration for a teacher without habits [s].
     """
 
     name: str
@@ -55,7 +55,7 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Habits:
-    r"""Habits of one teacher, which are the same in all of his demonstrations.
+    r"""Habits of one teacher, which are the same in all demonstrations of this teacher.
 
     The progress is :math:`p = m(w(u))` of the fraction u of the duration, with the minimum-jerk profile
     :math:`m(w) = 10 w^3 - 15 w^4 + 6 w^5` and the warp :math:`w(u) = u + e\, u (1 - u) + h \sin(2 \pi u) / (2 \pi)`.
@@ -65,7 +65,7 @@ class Habits:
         eagerness: e, positive when the teacher is fast at first and slow towards the goal.
         hesitation: h, positive when the teacher is slow in the middle.
         curvature: factor k of the bends; above 1, the teacher exaggerates them.
-        offset: displacement in units of the motion's spread, shape (2,).
+        offset: displacements :math:`o_i` in units of the motion's spread, shape (2,).
         noise: standard deviation of the wobble [m].
     """
 
@@ -91,7 +91,7 @@ class Habits:
         )
 
     def progress(self, u: Array) -> Array:
-        """Return the progress, from 0 to 1 without stepping back, at fractions ``u`` (n,) of the duration."""
+        """Return the progress at the fractions ``u`` (n,) of the duration; it never decreases from 0 to 1."""
         w = u + self.eagerness * u * (1.0 - u) + self.hesitation * np.sin(2.0 * np.pi * u) / (2.0 * np.pi)
         return np.asarray(10 * w**3 - 15 * w**4 + 6 * w**5)
 
@@ -100,7 +100,7 @@ NO_HABITS = Habits()
 
 
 def s_shaped_reach(*, planar: bool) -> Motion:
-    """Return an S-shaped reach of 0.6 m, precise at both ends and variable between them.
+    """Return an S-shaped reach of 0.6 m, which is precise at both ends and varies between them.
 
     Args:
         planar: whether to keep the height constant, as in a task on a table.
@@ -124,7 +124,7 @@ def s_shaped_reach(*, planar: bool) -> Motion:
 
 
 def along(axis: int, values: Array) -> Array:
-    """Return displacements (n, 3) along one axis, for the components ``values`` (n,)."""
+    """Return displacements (n, 3) along the axis number ``axis`` with the components ``values`` (n,)."""
     return np.eye(3)[axis] * values[:, None]
 
 
@@ -134,10 +134,10 @@ def demonstrate(
     """Let one teacher demonstrate a motion.
 
     Args:
-        motion: what to demonstrate.
-        habits: how the teacher moves.
-        n_demonstrations: how many.
-        rng: source of the differences between the demonstrations.
+        motion: motion to demonstrate.
+        habits: habits of the teacher.
+        n_demonstrations: number of demonstrations.
+        rng: random generator for the differences between the demonstrations.
         source: name of the teacher; the demonstrations are numbered.
     """
     u = np.linspace(0.0, 1.0, _SAMPLES)
@@ -159,9 +159,9 @@ def demonstrations_by(motion: Motion, teachers: int, *, repeats: int = REPEATS) 
     """Return the demonstrations of several teachers; they differ in duration and speed, so align them before learning.
 
     Args:
-        motion: what to demonstrate.
+        motion: motion to demonstrate.
         teachers: number of teachers; the first of ten teachers is the same person as a single teacher.
-        repeats: demonstrations by each teacher.
+        repeats: number of demonstrations by each teacher.
 
     Raises:
         InputError: when a number is below 1.
@@ -180,7 +180,7 @@ def s_shaped_demonstrations(*, planar: bool, n_demonstrations: int = REPEATS, se
 
     Args:
         planar: whether to keep the height constant.
-        n_demonstrations: how many.
+        n_demonstrations: number of demonstrations.
         seed: seed of the differences between the demonstrations.
     """
     rng = np.random.default_rng([1, seed])

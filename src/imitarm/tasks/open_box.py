@@ -46,7 +46,7 @@ def open_box(pose: Pose, inside: tuple[float, float, float], thick: float = _THI
     """Return the five boards of a box without a lid.
 
     Args:
-        pose: frame of the box: its origin is in the middle of the upper side of the bottom, and the box is open along
+        pose: pose of the box's frame. The origin is in the middle of the bottom's upper side; the box is open along
             positive z.
         inside: size of the inside [m].
         thick: thickness of the boards [m].
@@ -68,7 +68,7 @@ def open_box(pose: Pose, inside: tuple[float, float, float], thick: float = _THI
 
 @dataclass(frozen=True)
 class OpenBoxTask:
-    """A Panda with a gripper at a table: it reaches from one side of the table into an open box on the other side.
+    """A Panda with a gripper reaches from one side of a table into an open box on the other side.
 
     Obstacles stand on the table between the start and the box. The task succeeds if the tool is at the goal inside the
     box and nothing was touched. The simulator's geometry measures contact.
@@ -108,10 +108,10 @@ class OpenBoxTask:
 
     @classmethod
     def motion(cls, *, planar: bool = False) -> Motion:
-        """Return the reach as teachers with habits show it: up, over the rim of the box, and down into it.
+        """Return the motion that teachers with habits demonstrate: up, over the rim of the box, and down into the box.
 
-        The curve is a cubic Bezier curve; the tool leaves the start and arrives at the goal vertically. Teachers
-        exaggerate its height, and differ most in the middle.
+        The curve is a cubic Bezier curve. The tool leaves the start vertically, and arrives at the goal vertically.
+        Teachers exaggerate the height of the curve, and differ most in the middle of the motion.
 
         Args:
             planar: whether the reach leads at constant height into a box that lies on its side.
@@ -153,11 +153,11 @@ class OpenBoxTask:
 
         Args:
             rng: source of the random numbers.
-            n_obstacles: how many.
+            n_obstacles: number of obstacles.
             path: positions along the path, shape (n, 3) [m]; None: the path of :meth:`motion`.
 
         Raises:
-            InputError: when there is no place for so many.
+            InputError: when there is not enough space for so many obstacles.
         """
         path = cls.motion().curve(np.linspace(0.0, 1.0, 200)) if path is None else path
         centers, radii = _start_spheres()
@@ -176,7 +176,7 @@ class OpenBoxTask:
                 made.append(obstacle)
             elif rng.random() < 0.02:  # there may be no place left: begin again
                 made.clear()
-        raise InputError(f"OpenBoxTask: no place for {n_obstacles} obstacles; choose fewer")
+        raise InputError(f"OpenBoxTask: not enough space for {n_obstacles} obstacles; choose fewer")
 
     def world(self, arm: ArmModel) -> mujoco.MjSpec:
         """Return the world without the box and the obstacles: arm and table."""

@@ -52,14 +52,14 @@ _TABLE = (0.50, 0.0), (0.80, 1.30, 0.04)  # [m] its top is at height 0
 
 @dataclass(frozen=True)
 class PackingTask:
-    """A Sawyer with a gripper picks a cube and puts it into a packing box that moves, while a bottle is pushed about.
+    """A Sawyer with a gripper puts a cube into a moving packing box, while a bottle is pushed into the arm's way.
 
-    The box slides back and forth on the table. The bottle is pushed at random times from the side into the way of the
-    gripper, and out of it again. The task succeeds if the cube rests in the box, and the arm has
-    touched neither the bottle nor the box.
+    The box slides back and forth on the table. At random times, the bottle is pushed from the side into the way of the
+    gripper, and later out of the way. The task succeeds if the cube rests in the box, and the arm has touched neither
+    the bottle nor the box.
 
     Attributes:
-        seed: seed of the places and the motions.
+        seed: seed of the places and motions of cube, box and bottle.
         moving: whether box and bottle move.
     """
 
@@ -126,7 +126,7 @@ class PackingTask:
         return None
 
     def truth(self) -> MovingScene:
-        """Return what a sensor can see: the box as one solid, and the bottle, as they really move."""
+        """Return the true motion of the objects that a sensor can see: the box as one solid body, and the bottle."""
         return MovingScene(
             Scene(None, (self._solid_box(0.0), self._bottle()), fixtures=packing_fixtures()),
             {BOX: lambda t: self._solid_box(t).pose.position, BOTTLE: self.bottle_at},
@@ -139,7 +139,7 @@ class PackingTask:
         return np.array([x + 2.0 * _THICK, y + 2.0 * _THICK, z + _THICK])
 
     def box_around(self, middle: Array) -> Box:
-        """Return the box as one solid on the table, around a place (2,) [m]."""
+        """Return the box as one solid body on the table, with its centre at ``middle``, x and y, shape (2,) [m]."""
         center = np.array([*middle, 0.5 * self.rim])
         return Box(Pose(center, np.array([1.0, 0.0, 0.0, 0.0])), self.outer, name=BOX)
 
@@ -236,11 +236,11 @@ def _pushes(seed: int) -> PchipInterpolator:
 
 
 def reach(start: Array, goal: Array, rise: float) -> Motion:
-    """Return a motion that leaves the start upwards and arrives at the goal from above, a cubic Bezier curve.
+    """Return a cubic Bezier curve that leaves the start upwards and arrives at the goal from above.
 
     Args:
-        start: shape (3,) [m].
-        goal: shape (3,) [m].
+        start: start position of the tool, shape (3,) [m].
+        goal: goal position of the tool, shape (3,) [m].
         rise: height of the curve's control points above start and goal [m].
     """
     up = np.array([0.0, 0.0, rise])
@@ -264,8 +264,8 @@ def reach(start: Array, goal: Array, rise: float) -> Motion:
 def packing_skills(teachers: int = 3) -> tuple[Skill, Skill]:
     """Return the two skills of the task, learned from synthetic teachers: reach the cube, and carry it over the box.
 
-    The skills are learned with the cube and the box in the middle of their places, so that each run asks for other
-    goals than those that were shown.
+    In the demonstrations, the cube and the box are in the middle of the areas in which they may be placed. In each run,
+    the goals therefore differ from the demonstrated goals.
 
     Args:
         teachers: number of teachers, with eight demonstrations each.

@@ -1,4 +1,4 @@
-"""run_packing: one run of the packing task with RCAMO, from what a sensor and a tracker know of box and bottle."""
+"""run_packing: one run of the packing task with the policy RCAMO, a sensor, and a tracker of box and bottle."""
 
 from __future__ import annotations
 
@@ -64,7 +64,8 @@ def packing_policy(task: PackingTask, arm: ArmModel, grasp: Callable[[], Pose]) 
     Args:
         task: the task.
         arm: the arm with the gripper.
-        grasp: function that returns the pose of the tool in which the fingers close on the cube, as far as it is known.
+        grasp: function that returns the pose of the tool in which the fingers close on the cube, from the latest known
+            position of the cube.
     """
     reach, carry = packing_skills()
     spheres = arm.tool_spheres
@@ -102,7 +103,7 @@ def run_packing(
         arm: the arm, if it has been loaded already.
         observer: function that returns the ``observe`` of :func:`~imitarm.control_loop.reproduce` for the task and its
             simulated robot, see :data:`OBSERVERS`; None: :func:`sensed`.
-        on_step: called after each step.
+        on_step: function called after each control step.
 
     Returns:
         The measured motion, evaluated by :meth:`PackingTask.evaluate`.
@@ -129,10 +130,10 @@ def exact(task: PackingTask, robot: SimulatedRobot) -> Callable[[float], Scene]:
 
 
 class PackingDetector(ObstacleDetector):
-    """Finds cube, bottle and box by their colours; the box has a known size, and is found by its rim.
+    """Finds cube, bottle and box by their colours; the position of the box is computed from its rim.
 
-    An open box is not convex, so no convex shape fits what a camera sees of it. The rim is visible from above on all
-    four sides. Its middle is the middle of the box.
+    An open box is not convex, so no convex shape fits its visible points. From above, all four sides of the rim are
+    visible. The middle of the rim is the middle of the box, whose size is known.
 
     Args:
         task: the task.
@@ -162,11 +163,11 @@ class PackingDetector(ObstacleDetector):
 
 
 class Watched:
-    """What a depth camera with colours sees of the task; callable as ``observe(t)``.
+    """Observes box and bottle with a depth camera that also measures colours; call it as ``observe(t)``.
 
-    The camera stands in front of the table. Before the arm moves, it watches for one second, which the robot waits. The
-    cube is recognised by its colour. It is no obstacle, because the gripper must reach it; its last place is kept
-    while the gripper hides it.
+    The camera stands in front of the table. The robot waits for the first second, in which the camera observes the
+    scene. The cube is recognised by its colour. The cube is not an obstacle, because the gripper must reach it. While
+    the gripper hides the cube, its last measured position is used.
 
     Args:
         task: the task.
@@ -189,7 +190,7 @@ class Watched:
         watch(robot, self)
 
     def __call__(self, time: float) -> Scene:
-        """Return box and bottle as the camera and the tracker know them."""
+        """Return the scene with box and bottle, as estimated by the tracker from the camera's images."""
         scene = self._observe(time)
         others = []
         for obstacle in scene.obstacles:
@@ -200,7 +201,7 @@ class Watched:
         return replace(scene, obstacles=tuple(others))
 
     def grasp(self) -> Pose:
-        """Return the pose of the tool in which the fingers close on the cube where it was last seen on the table."""
+        """Return the pose of the tool in which the fingers close on the cube, at the cube's last measured position."""
         return self._cube
 
 

@@ -67,7 +67,7 @@ class StackEvaluation:
         success: whether all four cubes are stacked in order, without support by the gripper.
         failure: one of :data:`FAILURES`; empty on success.
         stacked: number of cubes in the tower, counted from cube 1.
-        reason: explanation.
+        reason: explanation of success or failure.
     """
 
     success: bool
@@ -95,11 +95,11 @@ class CubeHistory:
 
 @dataclass(frozen=True)
 class StackTask:
-    """A Sawyer with a parallel gripper at a table with four cubes of 32 mm; colours and pips show their numbers 1 to 4.
+    """A Sawyer with a parallel gripper at a table with four cubes of 32 mm, which are numbered from 1 to 4.
 
-    Cube 1 stays in its place; cubes 2, 3 and 4 are stacked on it in this order. The task succeeds if the cubes stand in
-    the order of their numbers, and the gripper does not support them. Each cube must be centred on the cube below it to
-    within the tolerance.
+    The colour and the dots of each cube show its number. Cube 1 stays in its place; cubes 2, 3 and 4 are stacked on
+    cube 1 in this order. The task succeeds if the cubes stand in the order of their numbers, and the gripper does not
+    support them. Each cube must be centred on the cube below it to within the tolerance.
 
     Contacts use MuJoCo's elliptic friction cones with ``impratio`` 10, so that a grasped cube does not slip out of the
     fingers. The setting ``condim`` 4 gives the finger pads torsional friction.

@@ -97,7 +97,7 @@ class StackResult:
 
 
 def stack_correspondence(person: Person, lengths: LimbLengths | None = None) -> Correspondence:
-    """Return the correspondence of person and robot for this task: scale 1, and the gripper always points down."""
+    """Return how this task relates the person to the robot: the scale is 1, and the gripper always points down."""
     lengths = LimbLengths(person.upper_arm, person.forearm) if lengths is None else lengths
     return Correspondence(lengths=lengths, orientation="fixed")
 

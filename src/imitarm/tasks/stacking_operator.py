@@ -77,7 +77,7 @@ class Habits:
         speed: mean speed of the hand over long distances [m/s].
         fine_speed: mean speed of the hand near a contact [m/s].
         tolerance: largest error at which the gripper looks aligned, so that the hand closes or opens [m].
-        sense_of_lag: the lag [s] that the person expects of the robot; the same for every retargeter.
+        sense_of_lag: lag with which the person expects the robot to follow the hand, the same for every retargeter [s].
         dwell: rest after the hand has closed or opened [s].
         height: additional height of movements over long distances [m].
         begin: duration for which the person first holds the hand still, so that the robot can begin to follow [s].

@@ -131,10 +131,10 @@ class SweepTask:
 
     @classmethod
     def motion(cls) -> Motion:
-        """Return the sweep as teachers with habits show it: over the dirt into the pan, at constant height.
+        """Return the sweep that teachers with habits demonstrate: over the dirt into the pan, at constant height.
 
-        The motion is precise at the start, at the dirt and at the goal. Between them, teachers bend it to the left or
-        to the right.
+        The motion is precise at the start, at the dirt and at the goal. Between these three places, teachers bend the
+        path to the left or to the right.
         """
         start, dirt, goal = (pose.position for pose in (cls.start, cls.dirt, cls.goal))
         at_dirt = float((dirt - start)[1] / (goal - start)[1])

@@ -34,7 +34,7 @@ _MAX_UNANSWERED = 256  # commands for which the skeleton they were computed from
 
 @dataclass(frozen=True, eq=False)
 class StepInfo:
-    """What happened in one control step; ``on_step`` receives this object.
+    """The result of one control step; the function ``on_step`` receives this object.
 
     Attributes:
         time: time since the start [s].
@@ -42,7 +42,7 @@ class StepInfo:
         command: command that the retargeter computed.
         state: measured state of the robot.
         engagement: state of the retargeter; None while the robot cannot be controlled.
-        problem: why the robot cannot be controlled; empty if it can.
+        problem: why the robot cannot be controlled; empty if it can be controlled.
     """
 
     time: float
@@ -69,7 +69,7 @@ class Summary:
         unsafe: number of steps in which no joint velocity could satisfy all limits and clearances.
         speed: largest joint velocity of the set-point, as a fraction of the joint's velocity limit.
         acceleration: largest joint acceleration of the set-point, as a fraction of the joint's acceleration limit.
-        interruptions: number of times that the robot became impossible to control.
+        interruptions: number of times that control of the robot was lost.
         reason: why the teleoperation has ended; empty while it runs.
         latency: duration of each processing stage, for each skeleton.
     """
@@ -94,14 +94,13 @@ class Teleoperation:
     """Lets a person move a robot in real time, at the retargeter's control period.
 
     In each period, the retargeter turns the newest skeleton into a joint velocity, the safety filter corrects this
-    velocity, and :meth:`Robot.move <imitarm.robots.robot.Robot.move>` sends it to the robot. Sometimes the robot cannot
-    be controlled, because it was stopped, was slowed down or does not answer. When the robot can be controlled again,
-    it is first brought to rest. The retargeter then starts again from the arm's current position, so the arm never
-    jumps.
+    velocity, and :meth:`Robot.move <imitarm.robots.robot.Robot.move>` sends it to the robot. At times, the robot cannot
+    be controlled, because it was stopped, was slowed down or does not answer. When control returns, the robot is first
+    brought to rest. The retargeter then starts again from the arm's current position, so the arm never jumps.
 
     Args:
         source: skeletons of one person, live or replayed in real time.
-        retargeter: the mapping from human arm to robot arm.
+        retargeter: method that converts the motion of the person's arm to the robot's motion.
         robot: robot to control.
         safety: safety filter that checks every command; None: the default filter, which keeps the arm within its
             limits, its links at least 10 mm apart, and the arm out of contact with the obstacles of the retargeter's

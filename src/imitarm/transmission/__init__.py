@@ -1,1 +1,1 @@
-"""Communication between capture, retargeting and robot: messages, datagrams, UDP sockets, fixed rates, latency."""
+"""Communication between capture, retargeting and robot: messages, datagrams, UDP sockets, rates and latencies."""

@@ -2,8 +2,8 @@
 
 A datagram consists of a header of 28 bytes and a payload, both little-endian. The message type alone determines the
 size of the payload; docs/transmission.md has a table of the fields. An invalid datagram is rejected with a reason. No
-part of a datagram is executed or used as a length. The only effect of a hostile datagram is therefore that it is
-counted.
+part of a datagram is executed or used as a length. The only effect of a hostile datagram is therefore that a counter
+increases.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def decode(data: bytes) -> tuple[Header, Message]:
             ``"version"``, ``"kind"``, ``"checksum"`` or ``"range"``.
     """
     if len(data) < _HEAD.size:
-        raise DatagramError("length", f"the datagram has only {len(data)} bytes, fewer than a header")
+        raise DatagramError("length", f"the datagram has only {len(data)} bytes, fewer than its header needs")
     magic, version, number, flags, session, sequence, time_ns, checksum = _HEAD.unpack_from(data)
     if magic != MAGIC:
         raise DatagramError("magic", "the datagram was not sent by imitarm")

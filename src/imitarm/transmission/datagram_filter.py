@@ -31,7 +31,7 @@ DROP_REASONS = {
     "foreign": "from a second sender, while the first is still active",
     "retired": "from a sender that has been replaced by another",
 }
-"""Reasons for dropping a datagram: the key under which each is counted, and its meaning."""
+"""Reasons for dropping a datagram: the keys under which dropped datagrams are counted, and their meanings."""
 
 _HALF = 2**31
 _MASK = 2**32 - 1
@@ -71,7 +71,8 @@ class ClockOffsetEstimator:
 
     An unconfirmed sample is rejected as a false time stamp in two cases:
 
-    * Two datagrams that arrive later have an earlier time stamp, although a sender's clock never goes back.
+    * Two datagrams that arrive after the sample have earlier time stamps than the sample, although a sender's clock
+      never goes back.
     * The datagrams before and after the sample agree with the confirmed minimum: three earlier datagrams gave samples
       near this minimum, and three later datagrams, which arrive over a period of at least ``max_age``, have a delay of
       at most ``max_age`` relative to this minimum. This case applies only while at most four samples are unconfirmed,
@@ -114,7 +115,7 @@ class ClockOffsetEstimator:
         return early
 
     def delay(self, offset: int, sent: int, now: int) -> float:
-        """Add a sample and return by how much its datagram was delayed [ns].
+        """Add a sample, and return the delay of its datagram [ns].
 
         Args:
             offset: time of receiving minus time stamp [ns].

@@ -23,7 +23,7 @@ _MAX_WAIT = 60_000_000_000  # [ns]
 
 
 class DatagramError(InputError):
-    """Raised for bytes that are not a valid datagram; ``reason`` is the key under which they are counted."""
+    """Raised for bytes that are not a valid datagram; ``reason`` is the key under which such bytes are counted."""
 
     def __init__(self, reason: str, what: str) -> None:
         super().__init__(f"datagram: {what}")
@@ -104,7 +104,7 @@ class JointCommand:
         velocity: joint velocities with which the arm should pass the positions ``q``, shape (n_joints,) [rad/s].
         arm: fingerprint of the arm model for which the command was computed.
         challenge: for ENABLE, the challenge number that the stopped robot sent; otherwise 0.
-        opening: commanded opening of the gripper [m], at most 1 m; None: leave it unchanged.
+        opening: commanded opening of the gripper [m], at most 1 m; None: the opening does not change.
     """
 
     KIND: ClassVar[int] = 2
@@ -222,7 +222,7 @@ Message = SkeletonFrame | JointCommand | JointState
 KINDS: dict[int, type[SkeletonFrame] | type[JointCommand] | type[JointState]] = {
     kind.KIND: kind for kind in (SkeletonFrame, JointCommand, JointState)
 }
-"""Each message type, by the number that stands for it in the header."""
+"""Each message type, by its number in the header of a datagram."""
 
 
 def _magnitude(values: Array) -> float:

@@ -1,4 +1,4 @@
-"""RateLimiter: runs a loop at a fixed rate without drift and skips the periods it has missed."""
+"""RateLimiter: runs a loop at a fixed rate without drift, and skips periods that were missed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class RateLimiter:
         sleep: function that waits for a time [s].
 
     Attributes:
-        ticks: number of periods so far, including the missed ones.
+        ticks: number of periods so far, including missed periods.
         overruns: number of missed periods.
 
     Raises:
@@ -47,7 +47,7 @@ class RateLimiter:
         return max(1e-9 * (self._start + self.ticks * self._period - self._clock_ns()), 0.0)
 
     def tick(self) -> int:
-        """Start the next period, which must be due, and return how many were missed."""
+        """Start the next period, which must be due, and return the number of periods that were missed before it."""
         now = self._clock_ns()
         if self._start is None:
             self._start = now
@@ -57,7 +57,7 @@ class RateLimiter:
         return missed
 
     def wait(self) -> int:
-        """Sleep until the next period is due, start it, and return how many were missed."""
+        """Sleep until the next period is due, start this period, and return the number of missed periods before it."""
         while (remaining := self.remaining) > 0.0:
             self._sleep(remaining)
         return self.tick()

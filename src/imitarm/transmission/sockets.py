@@ -33,7 +33,7 @@ def parse_address(text: str, *, host: str = LOOPBACK) -> Address:
 
 
 def resolved(address: Address) -> Address:
-    """Return an address in which the host name is replaced by its IP address.
+    """Return ``address`` with the host name replaced by its IP address.
 
     Raises:
         InputError: when the host is unknown.
@@ -46,7 +46,7 @@ def resolved(address: Address) -> Address:
 
 
 def listening(address: Address) -> socket.socket:
-    """Return a socket that receives at an address of this machine; port 0 stands for any free port.
+    """Return a socket that receives datagrams at an address of this machine; port 0 stands for any free port.
 
     Raises:
         InputError: when the port is in use, or the address does not belong to this machine.
@@ -69,7 +69,7 @@ def listening(address: Address) -> socket.socket:
 
 
 def connected(address: Address) -> socket.socket:
-    """Return a socket that sends to an address and receives only from this address.
+    """Return a socket that sends datagrams to an address, and receives datagrams only from this address.
 
     Raises:
         InputError: when the host is unknown, or there is no route to it.
@@ -98,12 +98,12 @@ def waiting(one: socket.socket, most: int = _AT_ONCE) -> Iterator[tuple[bytes, A
 
 
 def wait_for(one: socket.socket, seconds: float) -> bool:
-    """Wait until a datagram has arrived; return False if none has arrived within the given time."""
+    """Wait until a datagram has arrived; return False if none has arrived within ``seconds`` seconds."""
     return bool(select.select([one], [], [], max(seconds, 0.0))[0])
 
 
 def try_to_send(one: socket.socket, data: bytes, address: Address | None = None) -> bool:
-    """Send without waiting; return False if nobody listens or the send buffer of the operating system is full."""
+    """Send ``data`` without waiting; return False if nobody listens, or if the system's send buffer is full."""
     try:
         if address is None:
             one.send(data)

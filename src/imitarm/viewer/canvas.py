@@ -63,7 +63,7 @@ class Canvas:
         self.svg = ""
 
     def axes(self, left: float, bottom: float, right: float, top: float, **options: Any) -> Any:
-        """Return axes; the arguments are distances of the edges from the lower left corner of the figure [inch]."""
+        """Return axes. The arguments are the positions of their edges, from the figure's lower left corner [inch]."""
         width, height = self.size
         return self.figure.add_axes(
             (left / width, bottom / height, (right - left) / width, (top - bottom) / height), **options
@@ -115,7 +115,7 @@ def _inline(svg: str, name: str, description: str) -> str:
 
 
 def thin(n: int, most: int = POINTS) -> NDArray[np.int64]:
-    """Return at most ``most`` indices of ``n`` samples, evenly spaced and including the first and the last sample."""
+    """Return at most ``most`` evenly spaced indices of ``n`` samples, including the first and the last sample."""
     return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(np.int64))
 
 

@@ -30,7 +30,7 @@ def clearance(times: ArrayLike, distances: ArrayLike, required: float, *, name: 
         times: time stamps, shape (n_steps,) [s].
         distances: smallest distance between the arm, with its tool, and any obstacle, shape (n_steps,) [m].
         required: required clearance [m].
-        name: name, unique in the page.
+        name: name of the figure, unique in the page.
 
     Returns:
         An SVG element; an empty string when no distance is finite, because there was no obstacle.
@@ -87,7 +87,7 @@ def torques(
         values: torques, shape (n_steps, n_joints) [N m].
         limits: rated torque, shape (n_joints,) [N m].
         joint_names: names shown above the charts; by default, joints are numbered.
-        name: name, unique in the page.
+        name: name of the figure, unique in the page.
 
     Returns:
         An SVG element.
@@ -114,8 +114,8 @@ def displacement(lengths: ArrayLike, moved: ArrayLike, *, name: str = "displacem
 
     Args:
         lengths: lengths of the displacements, in the order of time, shape (n_components,) [m].
-        moved: which components were moved, shape (n_components,).
-        name: name, unique in the page.
+        moved: whether each component was moved, shape (n_components,).
+        name: name of the figure, unique in the page.
 
     Returns:
         An SVG element.
@@ -164,7 +164,7 @@ def selection(
         aic: Akaike information criterion for each number of components, lower is better, shape (n,); may be empty.
         held_out_error: root mean square distance to held-out demonstrations, shape (n,) [m]; may be empty.
         chosen: number of components that was chosen.
-        name: name, unique in the page.
+        name: name of the figure, unique in the page.
 
     Returns:
         An SVG element.
@@ -203,8 +203,8 @@ class JointCurve:
     Attributes:
         title: title above the chart.
         values: values over time, shape (n_steps,).
-        lower: lower limit.
-        upper: upper limit.
+        lower: lower limit, in the unit of the values.
+        upper: upper limit, in the unit of the values.
         zero: whether to draw a line at 0.
     """
 
@@ -219,7 +219,7 @@ def small_multiples(name: str, description: str, unit: str, times: Array, curves
     """Draw one small chart for each joint, with the limits of the joint.
 
     Args:
-        name: name, unique in the page.
+        name: name of the figure, unique in the page.
         description: description for screen readers.
         unit: label of the vertical axis.
         times: time stamps, shape (n_steps,) [s].

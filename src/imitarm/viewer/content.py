@@ -20,7 +20,7 @@ from imitarm.trajectory import Demonstration, Rollout, Trajectory
 from imitarm.viewer.recording import Recording
 
 CERTIFICATE_VOID = (
-    "an obstacle moves, so the certificate holds only for a motion on schedule, but the motion was not completed"
+    "an obstacle moves, so the certificate holds only while the motion is on schedule, but the motion did not finish"
 )
 
 Array = NDArray[np.float64]
@@ -143,7 +143,7 @@ class SceneResult:
 
     @property
     def certificate_void(self) -> bool:
-        """Whether the certificate is void, because an obstacle moves and the motion was not completed on schedule."""
+        """Whether the certified clearance is void: an obstacle moves, and the motion did not finish on schedule."""
         return self.adaptation is not None and self.adaptation.only_on_schedule and not self.success
 
     @property
@@ -165,7 +165,7 @@ class SceneResult:
 
 
 class Candidate(Protocol):
-    """How good one number of components is; :class:`imitarm.skills.mixture_fitting.Candidate` has these attributes."""
+    """Scores of one number of components; :class:`imitarm.skills.mixture_fitting.Candidate` has these attributes."""
 
     @property
     def n_components(self) -> int:
@@ -181,7 +181,7 @@ class Candidate(Protocol):
 
     @property
     def held_out_rmse_mm(self) -> float:
-        """Error on demonstrations that were held out of learning [mm]; NaN when none could be held out."""
+        """Error on demonstrations that were not used for learning [mm]; NaN when all had to be used."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,7 +49,7 @@ def merge(meshes: list[Mesh]) -> Mesh:
 
 
 def box(half_size: ArrayLike) -> Mesh:
-    """Return a box with edges of twice ``half_size`` (3,) [m]: six faces with four vertices each."""
+    """Return a box with edges of length ``2 * half_size`` (3,) [m]: six faces with four vertices each."""
     corners: list[Array] = []
     faces: list[tuple[int, int, int]] = []
     for axis in range(3):

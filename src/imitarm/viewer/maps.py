@@ -50,12 +50,12 @@ class View:
 
     @property
     def leftwards(self) -> bool:
-        """Whether the horizontal coordinate increases to the left, as y does if x points up."""
+        """Whether the horizontal coordinate increases to the left; so does y if x points up."""
         return (self.across, self.up) == (1, 0)
 
     @classmethod
     def best(cls, positions: ArrayLike) -> View:
-        """Return the view in which ``positions`` (n, 3) [m] extend furthest; the view from above is preferred."""
+        """Return the view in which ``positions`` (n, 3) [m] extend furthest, or nearly so; from above if possible."""
         spans = np.ptp(np.asarray(positions, dtype=float), axis=0)
         if spans[2] <= 1.25 * spans[:2].min():
             return cls(0, 1) if spans[0] >= spans[1] else cls(1, 0)
@@ -73,7 +73,7 @@ def drawn_map(
     """Yield axes that show the area between ``corners`` (2, 2) [m]; afterwards, convert the figure to SVG.
 
     Args:
-        name: name, unique in the page.
+        name: name of the figure, unique in the page.
         text: description of the figure, for screen readers.
         view: the axes to show.
         corners: lower and upper corner of the area that must be visible, shape (2, 2) [m].
@@ -121,7 +121,7 @@ class Grid:
 
     @classmethod
     def of(cls, axes: Any, view: View) -> Grid:
-        """Cover the axes."""
+        """Return a grid that covers the axes."""
         low, high = np.sort(np.array([axes.get_xlim(), axes.get_ylim()]), axis=1).T
         step = float((high - low).max()) / 160.0
         return cls(view, *(np.arange(low[i], high[i] + step, step) for i in range(2)))
@@ -165,7 +165,7 @@ def demonstrations(
         means: means of the components' positions, shape (n_components, 3) [m].
         covariances: covariances of the components' positions, shape (n_components, 3, 3) [m^2].
         predicted: the learned path.
-        name: name, unique in the page.
+        name: name of the figure, unique in the page.
 
     Returns:
         An SVG element.
@@ -288,9 +288,9 @@ def adaptation(
         means: means of the components before they were moved, shape (n_components, 3) [m].
         covariances: covariances of the components, shape (n_components, 3, 3) [m^2].
         displacement: displacement of the components, shape (n_components, 3) [m].
-        moved: which components were displaced, shape (n_components,).
+        moved: whether each component was displaced, shape (n_components,).
         measured: the measured path of the robot's tool.
-        name: name, unique in the page.
+        name: name of the figure, unique in the page.
 
     Returns:
         An SVG element.
@@ -341,7 +341,7 @@ def draw_components(
     displacement: ArrayLike | None,
     moved: ArrayLike | None,
 ) -> None:
-    """Draw the components; displaced components are drawn at the new position with an arrow from the old one."""
+    """Draw the components; a displaced component is drawn at its new position, with an arrow from its old position."""
     centres, spreads = np.asarray(means, dtype=float), np.asarray(covariances, dtype=float)
     shift = np.zeros_like(centres) if displacement is None else np.asarray(displacement, dtype=float)
     went = np.linalg.norm(shift, axis=1) > 0.0 if moved is None else np.asarray(moved, dtype=bool)

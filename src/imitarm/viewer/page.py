@@ -26,7 +26,7 @@ MM: Final = 1000.0  # [mm/m], and [ms/s]
 
 @dataclass(frozen=True)
 class Tile:
-    """A number in the header of a page: ``value`` as text, ``unit``, and ``label``, which says what the number is."""
+    """A number in the header of a page: ``value`` as text, ``unit``, and ``label``, the meaning of the number."""
 
     value: str
     unit: str
@@ -76,8 +76,8 @@ class Player:
 
     Attributes:
         title: title for screen readers.
-        own: the middle part of this player's 3-D page, which no other player shares; see :func:`shared_players`.
-        keys: its legend.
+        own: the middle part of this player's 3-D page, which differs between players; see :func:`shared_players`.
+        keys: entries of the player's legend.
     """
 
     title: str
@@ -237,13 +237,13 @@ def draw_page(draw: Callable[[], str], path: str | Path) -> Path:
 
     Args:
         draw: function that returns the page.
-        path: the file to write; its folder must exist.
+        path: path of the file to write; its folder must exist.
 
     Returns:
         The absolute path of the file.
 
     Raises:
-        InputError: when the file cannot be written there, or the drawing libraries are not installed.
+        InputError: when the file cannot be written, or the drawing libraries are not installed.
         TaskFailedError: when the disk is full.
     """
     target = check_writable(path)

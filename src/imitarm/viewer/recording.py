@@ -1,6 +1,6 @@
-"""Recording of a simulation for the 3-D playback: the poses of all bodies, and what a tracker predicted.
+"""Recording of a simulation for the 3-D playback: the poses of all bodies, and the predictions of a tracker.
 
-:class:`FrameRecorder` notes both at a fixed rate while the simulation runs.
+:class:`FrameRecorder` records both at a fixed rate while the simulation runs.
 """
 
 from __future__ import annotations
@@ -17,17 +17,18 @@ from imitarm.scene import Scene
 Array = NDArray[np.float64]
 
 AHEAD = 0.3
-"""Time from an observation to the prediction that is drawn [s]."""
+"""Time between an observation and the instant for which the drawn prediction is made [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Where a tracker expected one obstacle to be after :data:`AHEAD`, frame by frame.
+    """The positions that a tracker predicted for one obstacle, :data:`AHEAD` seconds ahead, for each frame.
 
     Attributes:
         name: name of the obstacle in the observed scenes.
-        positions: predicted positions of its local frame, shape (n_frames, 3) [m]; nan in frames without the obstacle.
-        covariances: covariances of its position, shape (n_frames, 3, 3) [m^2].
+        positions: predicted positions of the obstacle's local frame, shape (n_frames, 3) [m]; nan in frames without the
+            obstacle.
+        covariances: covariances of these positions, shape (n_frames, 3, 3) [m^2].
         extent: half extents of the obstacle along the axes of the base frame, shape (3,) [m].
     """
 
@@ -89,7 +90,7 @@ class FrameRecorder:
     """Records the poses of all bodies while a simulation runs, at most ``rate`` times per second."""
 
     def __init__(self, model: mujoco.MjModel, *, rate: float = 25.0) -> None:
-        """Start without frames.
+        """Create a recorder that contains no frames yet.
 
         Args:
             model: the model that will be simulated.
@@ -111,7 +112,7 @@ class FrameRecorder:
         Args:
             data: the state of the simulation, in which the body poses are up to date.
             time: simulated time [s]; None: ``data.time``.
-            scene: the observed scene, whose tracked obstacles are drawn where they are predicted to be.
+            scene: the observed scene; its tracked obstacles are drawn at their predicted positions.
         """
         now = float(data.time if time is None else time)
         if not self._frames or now >= self._frames[-1][0] + self._period - 1e-9:

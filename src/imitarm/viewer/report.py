@@ -65,10 +65,10 @@ def write_report(report: Report, path: str | Path) -> Path:
 
     Args:
         report: content of the page.
-        path: the file to write; its folder must exist.
+        path: path of the file to write; its folder must exist.
 
     Raises:
-        InputError: when the file cannot be written there, or the drawing libraries are not installed.
+        InputError: when the file cannot be written, or the drawing libraries are not installed.
         TaskFailedError: when the disk is full.
     """
     return draw_page(lambda: report_html(report), path)
@@ -276,7 +276,7 @@ def _scene_facts(scene: SceneResult) -> dict[str, Any]:
             "Adaptation time": number(MM * a.compute_time, 3, "ms"),
         }
         if getattr(a, "joints", None) is not None:
-            values["Certified clearance is that of"] = "every moving part of the arm"
+            values["Certified clearance holds for"] = "every moving part of the arm"
             values["Largest tilt of the tool"] = number(float(np.degrees(getattr(a, "tilt", 0.0))), 1, "degrees")
     if scene.rollout is not None:
         values["Duration of the motion"] = number(scene.rollout.trajectory.duration, 2, "s")
@@ -296,7 +296,7 @@ def _tool(scene: SceneResult) -> str:
     if reach == 0.0:
         return "a point"
     many = "one sphere" if len(spheres) == 1 else f"{len(spheres)} spheres"
-    return f"{many}, no point of which is farther than {number(MM * reach, 0, 'mm')} from the tool centre point"
+    return f"{many}, all within {number(MM * reach, 0, 'mm')} of the tool centre point"
 
 
 def _learning_figures(learning: LearningSummary) -> Iterator[Figure]:

@@ -29,7 +29,7 @@ def states(runs: Sequence[tuple[str, Retargeting]], *, name: str = "states") -> 
 
     Args:
         runs: title and retargeted motion of each method.
-        name: name, unique in the page.
+        name: name of the figure, unique in the page.
 
     Returns:
         An SVG element.
@@ -75,7 +75,7 @@ def tool(run: Retargeting, path: Array, *, name: str = "tool") -> str:
     Args:
         run: the retargeted motion.
         path: path of the tool, shape (n, 3) [m].
-        name: name, unique in the page.
+        name: name of the figure, unique in the page.
 
     Returns:
         An SVG element.
@@ -162,7 +162,7 @@ def elbow(run: Retargeting, points: Array, *, name: str = "elbow") -> str:
     Args:
         run: the retargeted motion.
         points: the robot's shoulder, elbow and wrist, shape (n, 3, 3) [m].
-        name: name, unique in the page.
+        name: name of the figure, unique in the page.
 
     Returns:
         An SVG element; an empty string when the person's elbow was never known.

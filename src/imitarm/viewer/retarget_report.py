@@ -52,7 +52,7 @@ _WORDS: Final = {
     "Frames beyond a limit": "Control periods in which a joint exceeds a limit of position, velocity or "
     "acceleration. The numbers are computed from the commanded joint positions, which the drives of a real arm would "
     "have to execute.",
-    "Smallest singular value": "How well the arm can move its tool in the direction in which moving is hardest. If the "
+    "Smallest singular value": "How fast the tool moves, at least, in relation to the joints. If the "
     "value is near 0, the arm is almost stretched or folded, and small motions of the tool need fast motions of the "
     "joints.",
     "Torque": "The torque that the motion needs, computed by inverse dynamics without friction. The weight "
@@ -65,9 +65,9 @@ class Measure:
     """One measured value of a retargeting, for a table.
 
     Attributes:
-        label: label as shown to the reader.
+        label: label of the value in the table.
         value: value in ``unit``; NaN when unknown.
-        unit: unit as shown to the reader.
+        unit: unit of the value in the table.
         digits: number of decimals.
         better: ``"less"`` or ``"more"``, whichever is better; ``""`` if neither is.
         fault: whether any value above 0 is a fault, which is marked in red.
@@ -167,10 +167,10 @@ def write_retarget_report(report: RetargetReport, path: str | Path) -> Path:
 
     Args:
         report: content of the page.
-        path: the file to write; its folder must exist.
+        path: path of the file to write; its folder must exist.
 
     Raises:
-        InputError: when the file cannot be written there, or the drawing libraries are not installed.
+        InputError: when the file cannot be written, or the drawing libraries are not installed.
         TaskFailedError: when the disk is full.
     """
     return draw_page(lambda: retarget_report_html(report), path)
@@ -219,7 +219,7 @@ def retarget_report_html(report: RetargetReport) -> str:
 
 
 def playback(report: RetargetReport, method: MethodResult, *, dark: bool = False) -> str:
-    """Return the 3-D page in which the person and the robot move side by side in synchrony.
+    """Return a 3-D page in which the person and the robot move side by side and at the same time.
 
     Args:
         report: report with the person and the scene.

@@ -258,8 +258,8 @@ def playback_html(
         paths: lines to draw.
         components: Gaussian components to draw as translucent ellipsoids.
         persons: people to draw; each must have as many frames as the recording.
-        camera: the initial view; None for a view of the whole model.
-        dark: dark controls and background.
+        camera: the initial view; None: a view of the whole model.
+        dark: whether controls and background are dark.
 
     Returns:
         The text of the page, which can be saved, opened from disk without a network, or shown in an iframe.

@@ -1,4 +1,4 @@
-"""Parts that all 3-D drawings need: meshes and floor of a model, a camera, colours for viser's lights, moving nodes."""
+"""Parts of every 3-D drawing: the meshes and the floor of a model, the camera, colours, and moving nodes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Camera:
 
     @classmethod
     def around(cls, points: ArrayLike, *, direction: ArrayLike = _VIEW, aspect: float = 16 / 9) -> Camera:
-        """Return a camera in ``direction``, as near as possible while all ``points`` (n, 3) [m] are visible.
+        """Return the nearest camera in the direction ``direction`` that shows all ``points`` (n, 3) [m].
 
         Args:
             points: points in the world frame that must be visible.
@@ -136,7 +136,7 @@ class Mover:
         }
 
     def show(self, frame: int) -> None:
-        """Send those attributes of a frame that differ from the previous frame's; the first frame is not sent."""
+        """Send the attributes of a frame that differ from the previous frame; nothing is sent for the first frame."""
         for name, values in self._poses.items():
             if self._changed[name][frame - 1]:
                 value: Any = bool(values[frame]) if values.ndim == 1 else values[frame]
@@ -149,9 +149,10 @@ def node_name(kind: str, *names: object) -> str:
 
 
 def lit(rgba: Sequence[float], *, linear: bool = False) -> tuple[float, float, float]:
-    """Return the colour that looks like ``rgba`` under viser's lights, which are brighter than those of MuJoCo.
+    """Return the colour that looks like ``rgba`` under viser's lights, which are brighter than MuJoCo's lights.
 
-    Set ``linear`` for viser's batched meshes, whose colours must be linear RGB; those of single meshes must be sRGB.
+    Set ``linear`` for viser's batched meshes, whose colours must be linear RGB. The colours of single meshes must be
+    sRGB.
     """
     srgb = np.asarray(rgba[:3], dtype=float)
     light = _EXPOSURE * np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)

@@ -36,7 +36,7 @@ _GRIP = 0.2  # [s] in which the closure follows a closing hand
 
 
 class JointPlant:
-    """A MuJoCo simulation of a robot arm that a joint controller moves; it includes gravity, but no contacts.
+    """A MuJoCo simulation of a robot arm that a joint controller moves. It includes gravity, but no contacts.
 
     The simulation includes rotor inertia, viscous damping and dry friction of the joints. ``ArmModel`` includes neither
     rotor inertia nor friction, so a controller that uses an ``ArmModel`` does not account for them.
@@ -129,15 +129,16 @@ class AdaptiveLaw:
         D \leftarrow [D + Q_D(\varepsilon\dot e - \gamma D)]_0^{D_{max}}
 
     where the forgetting factor is :math:`\gamma = a/(1 + b|\varepsilon|^2)`. The closure h of the person's hand (0
-    open, 1 closed) raises the largest stiffness: :math:`K_{max}(h) = K_{lo} + h(K_{hi} - K_{lo})`. The inertia matrix
-    M, the Coriolis matrix C and the gravity torque G are those of the rigid arm in ``ArmModel``. The adapted values F,
-    K and D compensate for rotor inertia and friction, which the rigid-arm model does not include. C consists of
-    Christoffel symbols, so that :math:`C(q, a)\,b = \tfrac12\,(c(a+b) - c(a) - c(b))` with :math:`c(v) = C(q, v)\,v`.
+    open, 1 closed) raises the largest stiffness: :math:`K_{max}(h) = K_{lo} + h(K_{hi} - K_{lo})`. All other symbols
+    (:math:`\kappa, \Gamma, Q_F, Q_K, Q_D, a, b, K_{lo}, K_{hi}, D_{max}`) are constant gains. The inertia matrix M, the
+    Coriolis matrix C and the gravity torque G are those of the rigid arm in ``ArmModel``. The adapted values F, K and D
+    compensate for rotor inertia and friction, which the rigid-arm model does not include. C consists of Christoffel
+    symbols, so that :math:`C(q, a)\,b = \tfrac12\,(c(a+b) - c(a) - c(b))` with :math:`c(v) = C(q, v)\,v`.
 
-    The control law is a discrete form of the laws of Yang et al. (IEEE Trans. Robotics 2011) and Li and Burdet; we
-    chose the gains. For small errors, :math:`\gamma = a` and :math:`Q_K \gamma = 1`, so the stiffness returns to
-    :math:`K_{min}` within one period. The papers do not specify :math:`K_{min}`. We set :math:`K_{min} = K_{max}(h)/2`,
-    so that the closure of the hand has an effect even for small errors.
+    The control law is a discrete form of the laws of Yang et al. (IEEE Trans. Robotics 2011) and Li and Burdet. The
+    values of the gains are our choice. For small errors, :math:`\gamma = a` and :math:`Q_K \gamma = 1`, so the
+    stiffness returns to :math:`K_{min}` within one period. The papers do not specify :math:`K_{min}`. We set
+    :math:`K_{min} = K_{max}(h)/2`, so that the closure of the hand has an effect even for small errors.
 
     Args:
         arm: arm model that provides M, C, G and the rated torques.
@@ -174,7 +175,7 @@ class AdaptiveLaw:
             q: joint positions, shape (n_joints,) [rad].
             velocity: joint velocities, shape (n_joints,) [rad/s].
             reference: desired joint positions, shape (n_joints,) [rad].
-            closure: closure of the person's hand, 0 open to 1 closed.
+            closure: closure of the person's hand, from 0 (open) to 1 (closed).
         """
         q, velocity, wanted = (np.asarray(x, dtype=float) for x in (q, velocity, reference))
         error = q - wanted

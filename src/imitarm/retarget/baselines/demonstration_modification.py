@@ -71,10 +71,10 @@ _SLOWEST = 10.0  # largest factor of slowing down
 class DemonstrationModification(BaselineRetargeter):
     """Baseline M1: our interpretation of "demonstration modification" in the thesis.
 
-    The method combines two published ideas. Argall's advice operators correct a segment of an execution according to a
-    teacher's advice. Mueller et al. 2018 annotate constraints and replace key frames that violate them. Argall's
-    paper is about policies of a mobile robot. We therefore designed corrections for the motion of an arm. A program,
-    not a teacher, selects these corrections.
+    The method combines two published ideas. In Argall's work, a teacher selects an "advice operator", which corrects
+    one segment of an executed motion. Mueller et al. 2018 annotate constraints and replace key frames that violate
+    them. Argall's paper is about policies of a mobile robot. We therefore designed corrections for the motion of an
+    arm. A program, not a teacher, selects these corrections.
 
     The method is offline. :meth:`run` processes the whole recording in four steps:
 
@@ -441,7 +441,7 @@ class SegmentCorrector:
         """Map the motion to the robot's joints, correct it as far as possible, and return it.
 
         Args:
-            motion: without joints.
+            motion: motion of the person, not yet mapped to joints of the robot.
             rounds: largest number of rounds of corrections.
         """
         dt = self._check.dt

@@ -29,12 +29,13 @@ class IncrementalIK(BaselineRetargeter):
 
     .. math:: \Delta q = J^+ \left(\Delta x_d + K\,e\right), \qquad e = \log(T_d\,T(q)^{-1}),
 
-    where :math:`\Delta x_d` is the displacement of the target since the last frame, and e the error relative to the
-    target of the last frame. The displacement is spread evenly over the control steps of one frame. The pseudo-inverse
-    is not damped. Without damping, even the smallest singular value is inverted, so the joint displacement grows
-    without bound near the edge of the workspace. Each joint is then limited to its velocity limit and to its range,
-    which changes the direction of the tool's motion. In ``notes``, ``"capped_steps"`` counts the control steps in which
-    a velocity limit was active, and ``"caps"`` counts the limited joints in all of these steps.
+    where :math:`J^+` is the pseudo-inverse of the tool's Jacobian, :math:`\Delta x_d` the displacement of the target
+    since the last frame, and e the error of the tool's pose T(q) relative to the target pose :math:`T_d` of the last
+    frame. The displacement is spread evenly over the control steps of one frame. The pseudo-inverse is not damped.
+    Without damping, even the smallest singular value is inverted, so the joint displacement grows without bound near
+    the edge of the workspace. Each joint is then limited to its velocity limit and to its range, which changes the
+    direction of the tool's motion. In ``notes``, ``"capped_steps"`` counts the control steps in which a velocity limit
+    was active, and ``"caps"`` counts the limited joints in all of these steps.
 
     The movement primitives of the cited paper are left out. Movement primitives belong to the learned skill and can be
     used with every method. If M3 included movement primitives, a comparison would evaluate the primitives instead of

@@ -69,9 +69,9 @@ class NURBS:
 
     .. math:: C(u) = \frac{\sum_i N_{i,p}(u)\, w_i P_i}{\sum_i N_{i,p}(u)\, w_i}
 
-    :math:`N_{i,p}` are the functions of :func:`basis_functions` with the knots :math:`\{a, \dots, a, u_{p+1}, \dots,
-    u_{m-p-1}, b, \dots, b\}`, in which a and b are repeated p + 1 times. For a curve that is fitted to a motion, the
-    parameter u is the time [s].
+    :math:`N_{i,p}` are the functions of :func:`basis_functions` with the knots
+    :math:`\{a, \dots, a, u_{p+1}, \dots, u_{m-p-1}, b, \dots, b\}`, in which a and b are repeated p + 1 times; the last
+    knot has the index m. For a curve that is fitted to a motion, the parameter u is the time [s].
 
     Attributes:
         knots: shape (n + degree + 1,).

@@ -74,7 +74,7 @@ class HumanArmTracker:
         angles: joint angles tau of the person's arm, shape (7,) [rad]; None before the first frame.
 
     Args:
-        iterations: per frame.
+        iterations: number of updates per frame.
         faults: misprints from :data:`PRINTED` to reproduce; only ``"limbs"``, ``"dh"``, ``"error"``, ``"rpy"`` and
             ``"step"`` affect this class.
     """
@@ -85,7 +85,7 @@ class HumanArmTracker:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past."""
+        """Delete the angles of previous frames."""
         self.angles: Array | None = None
         self._time = -math.inf
 
