@@ -82,7 +82,7 @@ def test_real_recordings_in_the_wrong_unit(real_data):
     units = [finding for finding in findings if finding.code == "units"]
     assert len(units) == 9
     assert {f.severity for f in units} == {"error"}
-    assert all('units="cm" (then the motion is 0.' in f.remedy for f in units)
+    assert all('units="cm" (the motion then extends over 0.' in f.remedy for f in units)
 
 
 def test_real_recordings_with_a_stranger_among_them(real_data):

@@ -36,13 +36,13 @@ class Command:
         twist: twist of the tool in the base frame, linear velocity first, shape (6,) [m/s, rad/s].
         joint_velocity: velocity of the joints, shape (n_joints,) [rad/s]; if given, it replaces the twist, for example
             along a planned joint path. None: the inverse kinematics computes the joint velocity from the twist.
-        posture: joint positions towards which the arm drifts in the null space of the twist, shape (n_joints,) [rad],
-            None: the arm has no preferred position.
+        posture: joint positions towards which the arm drifts in the null space of the twist, shape (n_joints,) [rad].
+            With None, the arm has no preferred position.
         elbow: SEW (shoulder-elbow-wrist) angle to which the elbow rotates in the null space of the twist [rad]; None:
             no preference.
         progress: completed fraction of the motion, 0 to 1; nan if unknown.
         status: state of the reproduction.
-        reason: reason why the motion is not nominal, with the name of the obstacle; empty when nominal.
+        reason: explanation of why the motion is not nominal, with the name of the obstacle; empty when nominal.
         opening: opening to which the gripper's fingers move [m]; None: the last commanded opening stays valid.
     """
 

@@ -79,8 +79,8 @@ _SHAPE = (len(JOINTS), 3)
 class SkeletonCamera:
     r"""A simulated skeleton camera with the errors of a real camera.
 
-    The page docs/capture.md describes how the errors of real cameras were measured. For each joint, a camera reports a
-    state: it *tracks* the joint, *infers* the position from other joints, or has *lost* the joint.
+    The page docs/capture.md describes how the errors of real cameras were measured. A camera *tracks* each joint,
+    *infers* its position from other joints, or has *lost* it.
 
     A joint at position x is measured at :math:`x + b + M c + n`. The slow error ``c`` has standard deviation ``sigma``
     on each axis across the line of sight, and ``1.4 sigma`` along the line of sight. For finger tips and thumbs, the
@@ -101,8 +101,7 @@ class SkeletonCamera:
     * Timing: on average, ``rate`` frames arrive per second, and the time between frames varies by ``jitter``. 3 % of
       the intervals between frames are twice the usual length, and 1 % of the frames show nobody.
     * Dropouts: for each arm, a dropout begins ``dropout`` times per second on average and lasts 2 to 20 frames. During
-      a dropout, one of three things happens: the arm is inferred, with three times its usual error; the arm is lost; or
-      the whole person is lost.
+      a dropout, the arm is inferred with three times its usual error, or the arm is lost, or the whole person is lost.
     * Occlusion: the joints of a forearm are inferred while the forearm is behind the torso. An elbow is inferred while
       it is behind the hand of the same arm.
     * Hand states: occasionally, the state of a hand is wrong for one or two frames.
@@ -117,7 +116,7 @@ class SkeletonCamera:
         elbow_bias: largest magnitude of the elbow's depth bias [m]; the actual bias is drawn uniformly between minus
             and plus this value.
         faultless: whether to omit dropouts, occlusions, jitter and wrong hand states; with ``sigma=0`` and
-            ``elbow_bias=0``, the camera reports the truth.
+            ``elbow_bias=0``, the camera then reports the true positions.
 
     Raises:
         InputError: when a value is out of range.

@@ -1,4 +1,4 @@
-"""Find faults in a recording of a person (``check``), and fix those that can be fixed for certain (``repaired``)."""
+"""Find faults in a recording of a person (``check``), and fix faults that need no guessing (``repaired``)."""
 
 from __future__ import annotations
 

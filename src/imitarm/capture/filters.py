@@ -160,8 +160,8 @@ def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
     .. math:: g_j = |l_j - l'_j| + |r_j - r'_j| - |l_j - r'_j| - |r_j - l'_j|
 
     The joints are swapped back if :math:`g_j` exceeds the threshold :math:`m(v) = \max(0.15, v t)` [m], where v is the
-    largest plausible speed of a joint: 0.5 m/s for shoulders and hips, and 4 m/s for the joints of an arm. Three
-    conditions are tested in this order:
+    largest plausible speed of a joint (0.5 m/s for shoulders and hips, 4 m/s for the joints of an arm). The function
+    tests three conditions, one after the other:
 
     1. The whole body is swapped back if :math:`\sum_j g_j > \sum_j m(0.5)` over the pairs of shoulders and hips.
     2. Elbows, wrists and hands are swapped back if :math:`g_j > m(4)` for the elbows and also for the wrists.
@@ -295,8 +295,8 @@ class SideFilter(SkeletonSource):
 class RealtimeSource(SkeletonSource):
     """Delays the skeletons of a source so that they arrive in real time.
 
-    Time 0 is the first reading. Each skeleton is returned no earlier than its time stamp relative to the first
-    skeleton.
+    The clock starts with the first call of :meth:`read`. Each skeleton is returned no earlier than its time stamp
+    relative to the first skeleton.
 
     Args:
         source: source that returns skeletons as fast as they are read.

@@ -313,8 +313,8 @@ class MotionCapture:
 
         Args:
             path: path of the file.
-            to_body: rotation matrix from the file's axes to the person's axes (x forward, y left, z up), shape (3, 3);
-                None: the file already uses the person's axes.
+            to_body: rotation matrix, shape (3, 3), from the file's axes to the person's axes (x forward, y left, z up).
+                With None, the file already uses the person's axes.
 
         Raises:
             FileFormatError: when the file is not a motion capture of a right arm; the message names the fault and the

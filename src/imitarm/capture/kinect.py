@@ -151,7 +151,7 @@ class KinectV2Source(BodyCamera):
             self._sensor = self._driver.KinectSensor(self._driver.StreamType.BODY)
         except (self._driver.KinectError, OSError) as error:
             raise InputError(f"{self.name}: can't be opened ({error}); {_V2_NEEDS}; {INSTEAD}") from error
-        self._wait_for_first(_V2_START, "is the camera plugged in, with its power supply")
+        self._wait_for_first(_V2_START, "is the camera connected to this computer and to its power supply")
 
     def _frame(self, timeout: float) -> list[Skeleton] | None:
         try:

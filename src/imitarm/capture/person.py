@@ -1,4 +1,4 @@
-"""Person: a seeded synthetic person with limb lengths, a position in front of the sensor and an elbow posture."""
+"""Person: a synthetic person with limb lengths, a position and an elbow posture, all determined by a seed."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ class Person:
     An arm consists of two straight bones with lengths :math:`L_U` and :math:`L_F`. For a given shoulder S and wrist W,
     the elbow E lies on a circle about the line from S to W. Let :math:`\hat w` be the unit vector along this line, and
     :math:`\hat d` and :math:`\hat o` two unit vectors perpendicular to it. When the arm points forward, :math:`\hat d`
-    points down and :math:`\hat o` points outwards; both vectors rotate with the arm. The swivel angle :math:`\psi` says
-    where on the circle the elbow is:
+    points down and :math:`\hat o` points outwards; both vectors rotate with the arm. With the swivel angle
+    :math:`\psi`, the elbow is at
 
     .. math:: E = S + a\,\hat w + h\,(\cos\psi\,\hat d + \sin\psi\,\hat o), \qquad
               a = \frac{L_U^2 + r^2 - L_F^2}{2r},\quad h = \sqrt{L_U^2 - a^2},\quad r = |W - S| .
@@ -172,7 +172,8 @@ class Person:
         return Skeleton(time, points, hand_states=(states["left"], states["right"]))
 
     def elbow(self, shoulder: Array, wrist: Array, swivel: float, side: str = "right") -> tuple[Array, Array]:
-        """Return elbow (at angle ``swivel`` [rad]) and wrist (moved into reach if necessary), (3,) each [m]."""
+        """Return the positions (3,) [m] of the elbow, at the angle ``swivel`` [rad], and of the wrist, moved into
+        reach."""
         to_wrist = wrist - shoulder
         distance = math.sqrt(to_wrist @ to_wrist)
         along = to_wrist / distance if distance > 1e-6 else _FORWARD

@@ -34,7 +34,7 @@ _GAP: Final = 0.25  # [s] a longer gap in a recording is not filled with frames
 
 
 class SkeletonRecording(SkeletonSource):
-    """Skeletons in the order in which they were recorded. A recording is also a source, which replays them once.
+    """Skeletons in the order in which they were recorded; a recording is also a source that replays the skeletons once.
 
     Skeletons are neither checked nor changed: times may decrease, and there may be several persons.
     :func:`~imitarm.capture.checks.check` lists the faults.
@@ -193,7 +193,7 @@ def read_recording(path: str | Path, *, realtime: bool = False) -> SkeletonRecor
     The format is detected from the content.
 
     Args:
-        path: path of the file; also of the ``.part`` file that a killed recorder left.
+        path: path of the file, or of the ``.part`` file that a killed recorder left.
         realtime: whether to replay at the recorded speed.
 
     Raises:

@@ -78,7 +78,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "developing methods, the other persons for testing them",
     )
     mapping.add_argument(
-        "--repeats", type=int, metavar="N", help="trials in which a person steers; default: 5 each (1 with --quick)"
+        "--repeats",
+        type=int,
+        metavar="N",
+        help="trials of each person with the simulated robot; default: 5 (1 with --quick)",
     )
     mapping.add_argument("--quick", action="store_true", help="use a few short recordings, for a quick test")
     mapping.add_argument(
@@ -92,21 +95,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--sigma", type=float, metavar="MM", help="standard deviation of the camera's error; default: 10 to 20 mm"
     )
     mapping.add_argument(
-        "--no-live", action="store_true", help="use recordings only, no trials in which a simulated person steers"
+        "--no-live", action="store_true", help="use only recordings; leave out the trials with the simulated robot"
     )
-    mapping.add_argument("--no-replay", action="store_true", help="use only trials in which a simulated person steers")
+    mapping.add_argument(
+        "--no-replay", action="store_true", help="use only trials with the simulated robot; leave out recordings"
+    )
     mapping.add_argument(
         "--data",
         type=Path,
         metavar="DIR",
-        help="folder of real recordings; the arm of a real person, recorded by motion capture, is then added",
+        help="folder of real recordings; adds the motion capture of a real person's arm to the recordings",
     )
     mapping.add_argument("--out", type=Path, metavar="DIR", help="folder of the results; default: benchmark-mapping")
     mapping.add_argument("--report", type=Path, metavar="FILE", help="write a page with figures and playback (HTML)")
     add_fill(mapping)
     mapping.add_argument("--fresh", action="store_true", help="ignore saved results and run all experiments again")
     mapping.add_argument(
-        "--reuse", action="store_true", help="use saved results of the same configuration even if other code made them"
+        "--reuse",
+        action="store_true",
+        help="use saved results of the same configuration even if another version of the code computed them",
     )
     add_workers(mapping)
     mapping.set_defaults(benchmark=_mapping)
@@ -181,7 +188,8 @@ def _add_placements(parsers: Any) -> None:
     )
     placed.set_defaults(benchmark=_placements)
     compared = parsers.add_parser(
-        "comparison", help="compare a policy with others in the placements that the others solve, from saved results"
+        "comparison",
+        help="from saved results, compare a policy with each other policy, where the other policy reached the goal",
     )
     compared.add_argument(
         "results", type=Path, nargs="+", metavar="RESULTS", help="files that 'placements --out' wrote"
@@ -328,7 +336,7 @@ def _placements(arguments: argparse.Namespace) -> int:
     if arguments.seeds < 1 or arguments.first < 0 or arguments.jobs < 1:
         raise InputError("--seeds and --jobs must be at least 1, and --first at least 0")
     if arguments.out is not None and arguments.skill is None:
-        raise InputError("--out needs --skill, because the skill that is used without --skill is not a file")
+        raise InputError("--out needs --skill, because the default skill is not a file")
     place = place_of(arguments, "placements")
     with tempfile.TemporaryDirectory() as folder, progress_bar() as bar:
         if arguments.skill is None:

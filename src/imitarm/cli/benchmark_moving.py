@@ -50,12 +50,15 @@ def add_moving(parsers: Any) -> None:
         "--first", type=int, default=first, metavar="N", help=f"first seed; {first} to {end - 1} are for tests"
     )
     moving.add_argument(
-        "--methods", nargs="+", metavar="NAME", help=f"policies and controls; default: {' '.join(default_methods())}"
+        "--methods",
+        nargs="+",
+        metavar="NAME",
+        help=f"policies and reference methods; default: {' '.join(default_methods())}",
     )
     for name, default, unit, text in (
-        ("noise", 5.0, "MM", "standard deviation of the sensor"),
-        ("rate", 30.0, "HZ", "rate of the sensor"),
-        ("latency", 33.0, "MS", "delay of the sensor"),
+        ("noise", 5.0, "MM", "standard deviation of a measured position"),
+        ("rate", 30.0, "HZ", "measurements per second"),
+        ("latency", 33.0, "MS", "delay of a measurement"),
         ("dropout", 0.0, "PERCENT", "probability that an obstacle is missed in a frame"),
         ("occlusions", 0.0, "HZ", "number of occlusions per second; each lasts 0.5 s"),
     ):
@@ -66,7 +69,7 @@ def add_moving(parsers: Any) -> None:
         "--out", type=Path, default=_FOLDER, metavar="DIR", help=f"folder of results; default: {_FOLDER}"
     )
     moving.add_argument("--fresh", action="store_true", help="ignore saved results and run all experiments again")
-    moving.add_argument("--reuse", action="store_true", help="use saved results even if other code made them")
+    moving.add_argument("--reuse", action="store_true", help="use saved results of another version of the code")
     add_workers(moving)
     moving.set_defaults(benchmark=_run)
     actions = moving.add_subparsers(metavar="ACTION", title="actions; if none is given, the experiments are run")
@@ -88,7 +91,9 @@ def experiments_of(arguments: argparse.Namespace) -> list[MovingExperiment]:
             are missing.
     """
     if arguments.count < 1 or arguments.first < 0:
-        raise InputError(f"--count must be at least 1 and --first at least 0: {arguments.count}, {arguments.first}")
+        raise InputError(
+            f"--count must be at least 1 and --first at least 0, got {arguments.count} and {arguments.first}"
+        )
     families = list(arguments.families or FAMILIES)
     if not arguments.families and not has_recordings():
         families.remove(_RECORDED)

@@ -17,7 +17,7 @@ from imitarm.perception import DepthNoise
 def add_perception(parsers: Any) -> None:
     """Add the parser of the command."""
     parser = parsers.add_parser(
-        "perception", help="compare obstacles that are detected in depth images with the simulator's truth"
+        "perception", help="compare obstacles detected in depth images with the true obstacles in the simulator"
     )
     parser.add_argument("--count", type=int, default=105, metavar="N", help="scenes of each family; default: 105")
     parser.add_argument("--first", type=int, default=2000, metavar="N", help="first seed; default: 2000")

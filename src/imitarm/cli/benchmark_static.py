@@ -72,10 +72,10 @@ def add_static(parsers: Any) -> None:
         help=f"put the obstacles on the paths of these skills, in the families {' '.join(ANY_SKILL)}",
     )
     static.add_argument(
-        "--torque", type=int, default=0, metavar="N", help="in the first N scenes of a family, compute torques as well"
+        "--torque", type=int, default=0, metavar="N", help="in the first N scenes of a family, also compute torques"
     )
     static.add_argument(
-        "--memory", type=int, default=0, metavar="N", help="in the first N scenes of a family, measure memory as well"
+        "--memory", type=int, default=0, metavar="N", help="in the first N scenes of a family, also measure memory use"
     )
     _add_running(static)
     static.set_defaults(benchmark=_run)
@@ -83,7 +83,9 @@ def add_static(parsers: Any) -> None:
     tuning = actions.add_parser("tune", help="search for the best options of each method on validation scenes")
     solvable = [family for family in FAMILIES if family != COVERED]  # no draw could succeed in the others
     _add_scenes(tuning, count=5, split="validation", families=solvable)
-    tuning.add_argument("--draws", type=int, default=DRAWS, metavar="N", help=f"trials per method; default: {DRAWS}")
+    tuning.add_argument(
+        "--draws", type=int, default=DRAWS, metavar="N", help=f"option sets per method; default: {DRAWS}"
+    )
     tuning.add_argument("--save", type=Path, metavar="FILE", help="file of the best options; default: DIR/tuned.json")
     _add_running(tuning)
     tuning.set_defaults(benchmark=_tune)
@@ -95,7 +97,7 @@ def add_static(parsers: Any) -> None:
     scaling.add_argument("--first", type=int, default=2000, metavar="N", help="first seed; default: 2000")
     add_fill(scaling)
     scaling.set_defaults(benchmark=_scaling)
-    refusals = actions.add_parser("refusals", help=f"check by a search (oracle) that {OURS} refused rightly")
+    refusals = actions.add_parser("refusals", help=f"check each refusal of {OURS} by a search (oracle)")
     _add_scenes(refusals, count=100, split="test", methods=False)
     _add_running(refusals)
     add_fill(refusals)
@@ -141,7 +143,7 @@ def _add_scenes(
         "--count", type=int, default=count, metavar="N", help=f"scenes of each family and dimension; default: {count}"
     )
     first, end = SPLITS[split]
-    text = f"first seed; {first} to {end - 1} are for {split}"
+    text = f"first seed; seeds {first} to {end - 1} are for {split}"
     parser.add_argument("--first", type=int, default=first, metavar="N", help=text)
 
 
@@ -150,7 +152,7 @@ def _add_running(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, default=_FOLDER, metavar="DIR", help=f"folder of results; default: {_FOLDER}"
     )
     parser.add_argument("--fresh", action="store_true", help="ignore saved results and run all experiments again")
-    parser.add_argument("--reuse", action="store_true", help="use saved results even if other code made them")
+    parser.add_argument("--reuse", action="store_true", help="use saved results of another version of the code")
     add_workers(parser)
 
 

@@ -33,7 +33,7 @@ def add_tracking(parsers: Any) -> None:
         "--windows", type=int, default=5000, metavar="N", help="short synthetic motions for the margins; default: 5000"
     )
     parser.add_argument(
-        "--noise", type=float, default=5.0, metavar="MM", help="standard deviation of the detections; default: 5"
+        "--noise", type=float, default=5.0, metavar="MM", help="standard deviation of detected positions; default: 5"
     )
     parser.add_argument(
         "--dropout", type=float, default=20.0, metavar="%", help="percentage of missed detections; default: 20"

@@ -218,7 +218,7 @@ def _guided(arguments: argparse.Namespace) -> SensorFit:
             if fit.suspect is None:
                 break
             number = at[fit.suspect]
-            remark(f"point {number + 1} is {1e2 * fit.residuals[fit.suspect]:.1f} cm off; touch it again")
+            remark(f"point {number + 1} is {1e2 * fit.residuals[fit.suspect]:.1f} cm off; touch this point again")
             seen |= touched_points(source, points, arguments.side, arguments.seconds, only=number)
     return fit
 

@@ -1,4 +1,4 @@
-"""``imitarm demo``: learn to sweep, sweep around obstacles that stand and obstacles that move, write a report."""
+"""``imitarm demo``: learn to sweep, sweep around standing and moving obstacles, and write a report."""
 
 from __future__ import annotations
 
@@ -33,8 +33,9 @@ examples:
 
 The package contains eight demonstrations of a sweep, in which a synthetic teacher guides the simulated Sawyer by hand.
 The command checks and aligns the demonstrations, and learns a skill from them.
-The command then reproduces the skill in seven scenes: one without obstacles, four with standing obstacles and two
-with moving obstacles. With --scenes, it uses the scenes that you name instead.
+The command then reproduces the skill in seven scenes.
+One scene has no obstacles, four have standing obstacles, and two have moving obstacles.
+With --scenes, the command uses the scenes that you name instead.
 A simulated sensor and a tracker observe the moving obstacles (noise 5 mm, 30 frames per second, 33 ms delay).
 T1 to T8 are eight scenes with two to four obstacles, modelled on the eight tasks of the thesis (Table 4.1).
 The command writes skill.json, report.html (opens offline in any browser) and results.json to FOLDER.

@@ -54,7 +54,7 @@ def add_source(parser: argparse.ArgumentParser, name: str = "source", purpose: s
     Args:
         parser: parser of the command.
         name: ``"source"``, or ``"--source"`` for an option.
-        purpose: what the command uses the source for; the help text of the argument begins with it.
+        purpose: what the command uses the source for; the help text of the argument begins with this text.
     """
     parser.add_argument(name, metavar="SOURCE", action=_SourceArgument, help=purpose)
 

@@ -1,4 +1,4 @@
-"""Arguments for all commands that read demonstrations, and the function that reads the files by these arguments."""
+"""Arguments for all commands that read demonstrations, and a function that reads the files with these arguments."""
 
 from __future__ import annotations
 

@@ -121,9 +121,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     held.add_argument("--not-down", action="store_true", help="never move the path downwards")
     moved = parser.add_argument_group("different start and goal")
     triple: Any = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
-    moved.add_argument("--start", **triple, help="start position of the tool [cm]; default: as learned")
+    moved.add_argument("--start", **triple, help="start position of the tool [cm]; default: the learned start")
     moved.add_argument(
-        "--goal", **triple, help="goal position of the tool [cm]; default: from the scene file, else as learned"
+        "--goal",
+        **triple,
+        help="goal position of the tool [cm]; default: the goal in the scene file, else the learned goal",
     )
     parser.add_argument(
         "--control", choices=("position", "torque"), default="position", help="control mode of the simulated drives"

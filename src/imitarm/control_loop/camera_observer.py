@@ -45,8 +45,8 @@ class CameraObserver:
     scene is empty, and its stamp is the time of the first call.
 
     **A camera that was moved.** Once per second, the surfaces in an image are compared with the known places of these
-    surfaces (:meth:`~imitarm.perception.ObstacleDetector.camera_error`). If two successive comparisons of one camera
-    disagree, the call raises an error, and the control loop brakes the robot.
+    surfaces (:meth:`~imitarm.perception.ObstacleDetector.camera_error`). If they are not at their known places in two
+    successive comparisons of one camera, the call raises an error, and the control loop brakes the robot.
 
     The time must not decrease from one call to the next, because a camera can't take images of the past.
 

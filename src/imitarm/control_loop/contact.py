@@ -47,8 +47,7 @@ class ContactDetector:
     of five torques. They come from the drives (:math:`\tau`), gravity (g), Coriolis forces (matrix C), friction
     (:math:`\tau_f`), and an external force F (:math:`\tau_e = J^T F`). The observer (De Luca, Albu-Schaeffer, Haddadin
     and Hirzinger, "Collision detection and safe reaction with the DLR-III lightweight manipulator arm", IROS 2006)
-    compares
-    the momentum with the integral of all torques except the external torques:
+    compares the momentum with the integral of the other four torques. Its residual r is
 
     .. math:: r = K \Big( p - \int (\tau - \tau_f + C^T \dot q - g + r)\, dt \Big), \qquad \dot r = K (\tau_e - r) .
 

@@ -64,7 +64,7 @@ class InterventionLog:
         count, unsafe = sum(one.count for one in found), sum(one.unsafe for one in found)
         first, last = min(one.first for one in found), max(one.last for one in found)
         sentence = (
-            f"the safety filter intervened in {count} steps, {first:.2f} to {last:.2f} s, "
+            f"the safety filter intervened in {count} steps, from {first:.2f} to {last:.2f} s, "
             f"mostly between {found[0].link} and {found[0].other}"
         )
         return f"{sentence}; no safe motion in {unsafe} of them" if unsafe else sentence

@@ -118,7 +118,7 @@ class SensorModel:
         return Frame(stamp, stamp + self.latency, tuple(seen))
 
     def arrived(self, truth: Scene | MovingScene, since: float, until: float) -> Iterator[Frame]:
-        """Yield the frames that arrive after ``since`` and not after ``until`` [s], in the order of their stamps."""
+        """Yield the frames that arrive after ``since`` [s] and up to ``until`` [s], in the order of their stamps."""
         first = math.floor((since - self.latency + _ROUNDING) * self.rate) + 1 if math.isfinite(since) else 0
         last = math.floor((until - self.latency + _ROUNDING) * self.rate)
         for k in range(first, last + 1):

@@ -102,8 +102,8 @@ def reproduce(
 
     Raises:
         InputError: when ``dt`` or ``timeout`` is not positive, or the policy does not return a Command.
-        InfeasibleError: when the arm starts in contact with an obstacle, or the policy refuses to start; the robot has
-            not moved.
+        InfeasibleError: when the arm starts in contact with an obstacle, or the policy refuses to start; in both cases,
+            the robot has not moved.
     """
     dt, timeout = finite_number(dt, "reproduce: dt", "s"), finite_number(timeout, "reproduce: timeout", "s")
     if not 0.0 < dt <= timeout:

@@ -1,4 +1,4 @@
-"""Align demonstrations: cut off rest at both ends, and warp time so that all motions pass a matching point at once.
+"""Align demonstrations: cut off rest at both ends, and warp time so that matching points have the same time.
 
 People never repeat a motion at exactly the same speed. A bend may therefore occur early in one demonstration and late
 in another. The mean of the demonstrations at equal times would smear a bend, because averaging cuts corners and

@@ -123,7 +123,7 @@ def check_gaps(motion: ValidRows) -> Iterator[Finding]:
             f"{count} of {steps[longest]:.3g} s (the usual step is {np.median(steps):.3g} s), in which the tool moved "
             f"{1e3 * moved:.0f} mm"
         )
-        remedy = "record again, or accept a straight line across the gap"
+        remedy = "record again, or accept that a straight line replaces the motion in the gap"
         yield motion.finding("warning", "gap", message, remedy, longest + 1)
 
 

@@ -1,7 +1,7 @@
 """Plausibility: checks of units, and of one motion against an arm.
 
-A remedy proposes the units that fit the numbers in the file, whatever unit they were read in. The checks against an arm
-are about joint names and units, joint limits, joint speed and reach.
+A remedy proposes all units that fit the numbers in the file. The checks against an arm concern joint names, joint
+units, joint limits, joint speed and reach.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _DEGREES = 2.5 * np.pi  # [rad] no joint rotates farther, so these are degrees
 
 
 def check_stamps(raw: RawDemonstration) -> Iterator[Finding]:
-    """Find time stamps that do not increase, are dates, or are in another unit than the one they were read in."""
+    """Find time stamps that do not increase, are dates, or are probably in a unit other than the assumed unit."""
     late = np.flatnonzero(raw.late())
     if len(late):
         row = int(late[0])
@@ -70,7 +70,7 @@ def check_stamps(raw: RawDemonstration) -> Iterator[Finding]:
 
 
 def check_units(motion: ValidRows) -> Iterator[Finding]:
-    """Find positions that are in another unit than the one they were read in, and propose every unit that fits."""
+    """Find positions that are probably in a unit other than the assumed unit, and propose every unit that fits."""
     raw = motion.raw
     distance = np.abs(motion.positions).max(axis=1)
     extent = float(np.ptp(motion.positions, axis=0).max())

@@ -23,7 +23,7 @@ def execute_within_limits(arm: ArmModel, joints: ArrayLike, dt: float) -> Array:
     r"""Return the joint positions of an arm that follows commands but keeps its limits, shape (n, n_joints) [rad].
 
     Let :math:`q^c_k` be the commanded and :math:`q_k` the actual position in control period k. The velocity of the arm
-    is the commanded velocity plus a correction towards the commanded position:
+    is the commanded velocity plus a correction towards the commanded position, limited by the function ``clip``:
 
     .. math:: \dot q_k = \mathrm{clip}\left((q^c_{k+1} - q^c_k) / dt + 5\,\mathrm{s}^{-1}\,(q^c_k - q_k)\right)
 

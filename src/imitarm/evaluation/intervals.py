@@ -213,8 +213,8 @@ def rate_interval(outcomes: Values) -> Interval:
     With this rule alone, one more failure could make the interval narrower: if only one person fails, the persons seem
     to differ; if a second person fails as well, they seem to be alike. To prevent this effect, the function also
     computes the interval of every result that is at least as good as ``outcomes`` in each trial, and returns the lowest
-    of the lower ends. In the same way, it considers every result that is at least as bad as ``outcomes`` in each trial,
-    and returns the highest of the upper ends.
+    of the lower ends. In the same way, it computes the interval of every result that is at least as bad as ``outcomes``
+    in each trial, and returns the highest of the upper ends.
 
     Args:
         outcomes: outcome of each trial, 1 for success, 0 for failure.

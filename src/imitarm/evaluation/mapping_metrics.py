@@ -62,7 +62,7 @@ class MappingMetrics:
             acceleration [m]. A method therefore gains nothing from commands beyond the limits.
         executed_rms_without_lag: ``executed_rms`` after removing the constant lag that gives the smallest value [m].
         target_rms: root mean square distance between the tool and the target that the method computed [m].
-        orientation_rms: root mean square angle between the tool's rotation and the reference [rad].
+        orientation_rms: root mean square angle between the rotations of the tool and of the reference [rad].
         elbow_direction_rms: root mean square angle between the actual and the correct direction of the robot's upper
             arm, see :func:`~imitarm.evaluation.tracking.elbow_direction_errors` [rad].
         elbow_angle_rms: root mean square of an angle difference: the change of the robot's SEW angle (swivel angle of

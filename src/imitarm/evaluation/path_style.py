@@ -1,4 +1,4 @@
-"""How far an executed path of the tool departs from the demonstrations, independently of its timing."""
+"""Measures how far an executed path of the tool departs from the demonstrations, regardless of its timing."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class PathStyle:
 
     Both paths are resampled at 200 points that are evenly spaced along the arc, so timing does not matter. Dynamic time
     warping then matches the points x_i of the executed path with points m_j of the mean path. It keeps the order of the
-    points and minimises the sum of squared distances. Let P be the set of matched pairs, and :math:`\Sigma_j` the
-    covariance of the demonstrations at m_j:
+    points and minimises the sum of squared distances. Let P be the set of matched pairs, and let :math:`\Sigma_j` be
+    the covariance of the demonstrations at m_j. Then
 
     .. math:: \mathrm{rmse}^2 = \frac1{|P|} \sum_{(i,j) \in P} |x_i - m_j|^2, \qquad
               \mathrm{deviation} = \max_i \min_{j: (i,j) \in P} \sqrt{(x_i - m_j)^T \Sigma_j^{-1} (x_i - m_j)}

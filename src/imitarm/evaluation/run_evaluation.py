@@ -118,13 +118,13 @@ class RunEvaluation:
     Attributes:
         run: the evaluated run.
         metrics: measures of the run, some of them relative to the person's arm.
-        tracking: how well the tool tracked the method's target.
+        tracking: how closely the tool tracked the method's target.
         target_lag: lag of the tool behind the method's target [s]; nan when the tool does not follow the target.
         hand_lag: lag of the tool behind the hand [s]; nan when the tool does not follow the hand.
         link_distance: smallest distance between links that are not neighbours, measured between spheres that cover the
             links [m].
-        truth_known: whether the measures compare the robot with the true hand; otherwise they compare it with the hand
-            that the camera measured.
+        truth_known: whether the measures compare the robot with the true hand; otherwise, they compare the robot with
+            the hand that the camera measured.
         warnings: remarks for the user about this run, one sentence each.
     """
 

@@ -181,7 +181,7 @@ def reference_positions(
 
 
 def reference_rotations(true: TrueArm, quaternions: Array, periods: EngagementPeriods, orientation: str) -> Array:
-    """Return the correct rotations of the tool, which the clutch law computes from the true hand: (n, 4), wxyz.
+    """Return the correct rotations of the tool (n, 4), wxyz; the clutch law computes them from the true hand.
 
     Args:
         true: the person's arm, in the axes of the base.

@@ -99,7 +99,7 @@ def resized(obstacle: Obstacle, size: Array) -> Obstacle:
 
     Args:
         obstacle: obstacle to resize; a convex hull is returned unchanged, because it has no size parameters.
-        size: new size in the form of :class:`~imitarm.scene.distances.PackedObstacles`, shape (3,) [m].
+        size: new size, as :class:`~imitarm.scene.distances.PackedObstacles` defines it for this shape, shape (3,) [m].
     """
     if isinstance(obstacle, Sphere):
         return replace(obstacle, radius=float(size[0]))

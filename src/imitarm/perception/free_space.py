@@ -19,9 +19,9 @@ class FreeSpace:
 
     Each pixel of a depth image has a ray, which ends at the measured depth. A point is empty if the ray of its pixel
     ends behind the point. A point is hidden if it is behind a surface, outside of the image, or in a pixel without a
-    measurement: an obstacle may be there. There is one exception. If a pixel and its eight neighbours measured nothing,
-    the surface is probably out of the camera's range, so the ray of this pixel counts as empty. Points inside known
-    objects, such as a table, belong to no obstacle and count as empty.
+    measurement. An obstacle may be at a hidden point. There is one exception. If a pixel and its eight neighbours
+    measured nothing, the surface is probably out of the camera's range, so the ray of this pixel counts as empty.
+    Points inside known objects, such as a table, belong to no obstacle and count as empty.
 
     Args:
         frame: depth image; None: no space is known to be empty or hidden, for example with a point cloud.
@@ -46,8 +46,8 @@ class FreeSpace:
 
         Args:
             points: points in the base frame [m].
-            margin: least distance from the point to the end of the ray behind it, in addition to three standard
-                deviations [m].
+            margin: smallest distance by which the ray must end behind the point [m]; three standard deviations are
+                added.
         """
         empty = np.zeros(points.shape[:-1], dtype=bool)
         for surface in self._surfaces:
@@ -63,8 +63,8 @@ class FreeSpace:
 
         Args:
             points: points in the base frame [m].
-            margin: least distance from the end of the ray to the point behind it, in addition to three standard
-                deviations [m].
+            margin: smallest distance by which the ray must end in front of the point [m]; three standard deviations are
+                added.
         """
         if self._frame is None:
             return np.zeros(points.shape[:-1], dtype=bool)

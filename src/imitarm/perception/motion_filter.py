@@ -219,13 +219,13 @@ class MotionFilter:
 
     An interacting multiple model (IMM) filter uses several models, and weights the models by the likelihood of the
     measurements. Before each prediction, the states of the models are mixed, because an obstacle may change its model.
-    The IMM filter assumes that this happens after ``DWELL_TIME`` [s] on average.
+    The IMM filter assumes that an obstacle changes its model after ``DWELL_TIME`` [s] on average.
 
     Attributes:
         orders: order of each model, that is, of the highest derivative in its state.
         noise: spectral density ``q`` of each model.
         initial_speed: standard deviation of each component of a new obstacle's velocity [m/s].
-        size: length ``m`` of the state.
+        size: number ``m`` of components of the state.
     """
 
     def __init__(self, motion: str, noise: float | Sequence[float] | None, initial_speed: float) -> None:
@@ -305,7 +305,7 @@ class MotionFilter:
         """Return the beliefs after each obstacle has been measured once.
 
         The matrices with 3 rows or columns are padded to the size of the state, because products of small contiguous
-        square matrices are faster than products of parts of larger ones.
+        square matrices are faster than products of parts of larger matrices.
 
         Args:
             belief: beliefs about k obstacles.
@@ -375,23 +375,23 @@ def updated(
     gate: float,
     max_speed: float,
 ) -> tuple[Array, Array, Indices, Array] | None:
-    """Predict and update all tracks by compiled code; None without it, or if the assignment is not obvious.
+    """Predict and update all tracks by compiled code; None without this code, or if the assignment is not obvious.
 
     It computes the same as :meth:`MotionFilter.predict`, ``assign`` and :meth:`MotionFilter.update`.
 
     Args:
-        mean: states of n tracks, shape (n, 1, s).
-        covariance: their covariances, shape (n, 1, s, s).
-        first: which tracks choose their detections before the others, shape (n,).
-        dt: time since these states [s].
+        mean: states of n tracks, each with s components, shape (n, 1, s).
+        covariance: covariances of these states, shape (n, 1, s, s).
+        first: whether each track chooses its detection before the other tracks, shape (n,).
+        dt: time from these states to the detections [s].
         noise: spectral density of the process noise.
         rows: rows of m detections (:attr:`Detection.row`), shape (m, 15).
-        gate: largest normalised innovation squared.
+        gate: largest normalised innovation squared of a possible assignment.
         max_speed: largest speed [m/s].
 
     Returns:
-        New states and covariances of the same shapes; index of the detection of each track (n,), -1 without one;
-        normalised innovation squared of each track (n,), valid where there is a detection.
+        New states and covariances of the same shapes; the index of each track's detection (n,), -1 for a track without
+        detection; and the normalised innovation squared of each track (n,), valid only for tracks with a detection.
     """
     kernel = library()
     if kernel is None:

@@ -131,7 +131,9 @@ class ObstacleDetector:
             raise InputError("ObstacleDetector: workspace must be the lowest and the highest corner of a box [m]")
         near, far = finite_array(depth_range, (2,), "ObstacleDetector: depth_range", "m").tolist()
         if not 0.0 <= near < far:
-            raise InputError(f"ObstacleDetector: depth_range must increase from at least 0 [m], got {depth_range}")
+            raise InputError(
+                f"ObstacleDetector: depth_range must be two increasing depths from 0 [m], got {depth_range}"
+            )
         self.depth_range = near, far
         self.noise = DepthNoise() if noise is None else instance(noise, DepthNoise, "ObstacleDetector: noise")
         self.surface_margin = finite_number(surface_margin, "ObstacleDetector: surface_margin", "m", at_least=0.0)
@@ -195,9 +197,9 @@ class ObstacleDetector:
     def camera_error(self, frame: Frame) -> str:
         """Return a message if the camera is not at the pose that the frame states; empty if no error is found.
 
-        If somebody has moved a camera, the known surfaces appear at wrong places. Either of two signs is enough. First,
-        many rays go through known surfaces. Second, the measured plane of a half-space or of the upper face of a box
-        deviates from its known place by more than 3 cm or 4 degrees, and hardly any points are at the known place.
+        If somebody has moved a camera, the known surfaces appear at wrong places. The function looks for two signs.
+        First, many rays go through known surfaces. Second, the measured plane of a half-space or of the upper face of a
+        box deviates from its known place by more than 3 cm or 4 degrees, and hardly any points are at the known place.
 
         Args:
             frame: depth image or point cloud.

@@ -22,7 +22,8 @@ class PointCloud:
         stamp: time at which the points were measured [s].
         measured: points in the sensor's frame, shape (n, 3) [m]; rows that are not finite are removed.
         sensor_to_base: pose of the sensor when the points were measured.
-        spacing: angle between neighbouring rays [rad]; times the distance, it gives the spacing of points on a surface.
+        spacing: angle between neighbouring rays [rad]. The distance of a surface times this angle is the spacing of its
+            points.
         colors: red, green and blue of each point, 0 to 1, shape (n, 3); None without colours.
 
     Raises:

@@ -35,8 +35,8 @@ def fit_shape(
     r"""Fit shapes of all kinds, choose the best shape, and extend it to parts that may be hidden.
 
     Let ``s`` be the root mean square of the distances of ``n`` points to the surface of a fitted shape with ``k``
-    parameters, but at least the standard deviation of the measurement. The shape with the smallest Bayesian information
-    criterion is chosen:
+    parameters, but at least the standard deviation of the measurement. The shape with the smallest value of the
+    Bayesian information criterion is chosen, which is
 
     .. math:: n \log s^2 + k \log n
 

@@ -397,7 +397,7 @@ def in_order(skeletons: Iterable[Skeleton]) -> list[Skeleton]:
     for i, (before, after) in enumerate(pairwise(frames)):
         if after.time <= before.time:
             raise InputError(
-                f"retarget: skeleton {i + 1} has time {after.time:g} s, which is not later than the skeleton before; "
+                f"retarget: skeleton {i + 1} has time {after.time:g} s, not later than the previous skeleton; "
                 "sort the recording by time, or keep only one person"
             )
     return frames

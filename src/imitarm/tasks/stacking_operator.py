@@ -70,7 +70,7 @@ class Habits:
         delay: time from seeing an error to the start of the corrective movement [s]; about 0.2 s for a visual
             correction.
         look_every: time between two looks at the gripper, each of which may lead to a correction [s].
-        gain: fraction of a small error that one correction covers, below 1.
+        gain: fraction of a small error that one correction removes, below 1.
         noise: standard deviation of the error of observed positions on each axis; a new error is drawn at each look
             [m].
         bias: constant error of the observed position of the gripper, 3 values [m].

@@ -233,8 +233,8 @@ class AdaptiveControl(BaselineRetargeter):
     (:class:`JointPlant`). The joint positions that the simulated arm reaches are the command to the robot. The method
     tracks joint angles, so the tool and the hand are at different positions.
 
-    Unless ``velocity_scaling`` is True, only the torque limits restrict the joint velocity. ``notes`` contains three
-    values:
+    Unless ``velocity_scaling`` is True, only the torque limits restrict the joint velocity. ``notes`` has these
+    entries:
 
     * ``"saturated"``: number of times that a joint reached its rated torque, over all joints and control steps;
     * ``"peak_torque"``: largest torque before limiting, as a multiple of the rated torque;

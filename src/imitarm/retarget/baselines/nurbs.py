@@ -119,7 +119,7 @@ class NURBS:
     def evaluate(self, u: ArrayLike) -> Array:
         """Return the points of the curve at ``u`` (k,), shape (k, d); beyond the ends the curve is constant.
 
-        A single number gives one point, shape (d,).
+        If ``u`` is a single number, the result is one point, shape (d,).
         """
         at = np.asarray(u, dtype=float)
         first, values = basis_functions(self.knots, self.degree, at.reshape(-1))
