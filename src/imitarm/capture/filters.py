@@ -160,8 +160,8 @@ def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
     .. math:: g_j = |l_j - l'_j| + |r_j - r'_j| - |l_j - r'_j| - |r_j - l'_j|
 
     The joints are swapped back if :math:`g_j` exceeds the threshold :math:`m(v) = \max(0.15, v t)` [m], where v is the
-    largest plausible speed of a joint (0.5 m/s for shoulders and hips, 4 m/s for the joints of an arm). The function
-    tests three conditions, one after the other:
+    largest plausible speed of a joint (0.5 m/s for shoulders and hips, 4 m/s for the joints of an arm). There are three
+    conditions, which are tested in this order.
 
     1. The whole body is swapped back if :math:`\sum_j g_j > \sum_j m(0.5)` over the pairs of shoulders and hips.
     2. Elbows, wrists and hands are swapped back if :math:`g_j > m(4)` for the elbows and also for the wrists.

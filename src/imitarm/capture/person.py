@@ -172,8 +172,7 @@ class Person:
         return Skeleton(time, points, hand_states=(states["left"], states["right"]))
 
     def elbow(self, shoulder: Array, wrist: Array, swivel: float, side: str = "right") -> tuple[Array, Array]:
-        """Return the positions (3,) [m] of the elbow, at the angle ``swivel`` [rad], and of the wrist, moved into
-        reach."""
+        """Return elbow and wrist, (3,) [m] each. The elbow is at the angle ``swivel`` [rad], the wrist within reach."""
         to_wrist = wrist - shoulder
         distance = math.sqrt(to_wrist @ to_wrist)
         along = to_wrist / distance if distance > 1e-6 else _FORWARD

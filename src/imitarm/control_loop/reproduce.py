@@ -233,7 +233,7 @@ class _Log:
             fault = "; ".join(filter(None, [fault, "touched: " + ", ".join(" with ".join(pair) for pair in touched)]))
         nearest = float(np.min(self.clearances, initial=np.inf))
         if not fault and required is not None and nearest < required:
-            fault = f"clearance fell to {1e3 * nearest:.1f} mm, {1e3 * required:.1f} mm required"
+            fault = f"clearance fell to {1e3 * nearest:.1f} mm, but {1e3 * required:.1f} mm are required"
             if self.clearances[0] < required:
                 fault += f"; at the start, the clearance was {1e3 * self.clearances[0]:.1f} mm"
         details: dict[str, Any] = {

@@ -50,10 +50,10 @@ def fit_shape(
     visible point is outside by more than twice the standard deviation of the noise.
 
     The covariance of the position is a sum of four terms. The first two result from the noise of the points and from
-    the distance between neighbouring rays. The third is a twentieth of the size, because no object has exactly the
-    fitted shape. The fourth results from the unknown size of the hidden part: a side that was extended by ``g`` may in
-    truth end anywhere in the extension. The true centre may therefore be displaced by up to ``g / 2``, which adds
-    ``g / sqrt(12)`` to the standard deviation.
+    the distance between neighbouring rays. The third corresponds to a standard deviation of a twentieth of the size,
+    because no object has exactly the fitted shape. The fourth results from the unknown size of the hidden part: a side
+    that was extended by ``g`` may in truth end anywhere in the extension. The true centre may therefore be displaced by
+    up to ``g / 2``, with a root mean square of ``g / sqrt(12)``.
 
     Args:
         visible: points to which the shapes are fitted.

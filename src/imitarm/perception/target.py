@@ -60,7 +60,7 @@ class Target:
         finite_number(self.size_tolerance, "Target: size_tolerance", "m", above=0.0)
 
     def has_color(self, colors: Array) -> NDArray[np.bool_]:
-        """Return which colours (n, 3) match the target's colour, shape (n,); all if the target may have any colour."""
+        """Return whether each of ``colors`` (n, 3) matches the target's colour, shape (n,); True if any colour does."""
         if self.color is None:
             return np.ones(len(colors), dtype=bool)
         total = colors.sum(axis=1)
@@ -70,7 +70,7 @@ class Target:
         return (apart <= self.color_tolerance) & near & (total >= _DARK)
 
     def has_shape(self, obstacle: Obstacle) -> bool:
-        """Return whether a detected shape matches the target's shape; True if the target may have any shape."""
+        """Return whether a detected shape matches the target's shape; True if any shape matches."""
         if self.shape is None:
             return True
         found, known = obstacle.solid(), self.shape.solid()

@@ -57,8 +57,8 @@ class ObstacleTracker:
 
     **Late detections.** Detections may arrive out of order. If an update is late by at most ``history`` seconds, it is
     inserted at its own time, and all later updates are computed again. The result is therefore the same as if all
-    updates had arrived in order. An update that is later than this is ignored, and :attr:`ignored` counts it as
-    ``"late"``.
+    updates had arrived in order. An update that is later by more than ``history`` is ignored, and :attr:`ignored`
+    counts it as ``"late"``.
 
     **Other imperfect input.** :attr:`ignored` also counts three other cases. A second update with the same stamp and
     the same detections is ignored (``"repeated"``). If two detections of one update differ insignificantly and one is

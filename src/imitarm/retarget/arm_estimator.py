@@ -69,7 +69,7 @@ class ArmEstimator:
     All retargeting methods use this estimator, so its filtering does not affect a comparison of the methods.
 
     Args:
-        correspondence: correspondence that contains the side of the person's arm and the pose of the sensor.
+        correspondence: object that states the side of the person's arm and the pose of the sensor.
         smoothing: whether to apply the One-Euro filter and to remove jumps that occur when the tracking state changes
             (:class:`~imitarm.retarget.smoothing.TrackingOffsets`); otherwise, the points with corrected bone lengths
             are returned unfiltered.
@@ -107,7 +107,7 @@ class ArmEstimator:
             one.reset()
 
     def update(self, skeleton: Skeleton) -> ArmEstimate | None:
-        """Return the estimate from the next skeleton; None if it is not newer than the last, or shows no usable arm."""
+        """Return the estimate from the next skeleton; None if it shows no usable arm or is not newer than the last."""
         if skeleton.time <= self._time:
             return None
         self._time = skeleton.time

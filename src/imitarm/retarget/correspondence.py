@@ -81,7 +81,7 @@ class Clutch:
     """The poses of hand and tool when the robot began to follow the person; see :class:`Correspondence`.
 
     Attributes:
-        correspondence: correspondence between the person's arm and the robot's.
+        correspondence: how the person's motion maps to the robot: side, sensor pose, scale and orientation.
         wrist: wrist position in the base frame when the robot began to follow, shape (3,) [m].
         hand: hand rotation in the base frame when the robot began to follow, quaternion wxyz, shape (4,).
         home: pose of the tool in the base frame when the robot began to follow.

@@ -84,7 +84,7 @@ class Engagement:
 
 
     Args:
-        correspondence: correspondence between the person's arm and the robot's.
+        correspondence: how the person's motion maps to the robot: side, sensor pose, scale and orientation.
         rule: times at which the state changes.
 
     Attributes:

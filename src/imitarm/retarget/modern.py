@@ -72,7 +72,7 @@ class ModernRetargeter(Retargeter):
 
     Args:
         arm: the robot's arm with its tool.
-        correspondence: correspondence between the person's arm and the robot's.
+        correspondence: how the person's motion maps to the robot: side, sensor pose, scale and orientation.
         dt: control period [s].
         scene: obstacles to avoid.
         gain: gain K of the twist towards the target [1/s].

@@ -107,14 +107,15 @@ class Retargeter(ABC):
         rule: durations after which the engagement changes its state.
         arm: the robot's arm with its tool.
         n_joints: number of joints of the arm.
-        correspondence: correspondence between the person's arm and the robot's.
+        correspondence: how the person's motion maps to the robot: side, sensor pose, scale and orientation.
         dt: control period [s].
         scene: obstacles; only some methods avoid them.
         latest: result of the last step.
 
     Args:
         arm: the robot's arm with its tool.
-        correspondence: correspondence between the person's arm and the robot's; None: the default correspondence.
+        correspondence: how the person's motion maps to the robot: side, sensor pose, scale and orientation. With None,
+            default values are used.
         dt: control period [s].
         scene: obstacles; None: no obstacles.
 

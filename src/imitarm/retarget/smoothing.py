@@ -214,7 +214,7 @@ class Hampel:
 
 
 class TrackingOffsets:
-    r"""Compensates for the jumps that occur when a joint changes between tracked and inferred.
+    r"""Compensates for the jumps that occur when the state of a joint changes between tracked and inferred.
 
     When a joint is hidden, a camera infers its position. The error of the inferred position is several times larger
     than the error of the tracked position. When the tracking state changes, the measured position jumps, mostly because

@@ -97,7 +97,7 @@ class Robot(ABC):
         A velocity beyond the limits is replaced by the nearest velocity within the limits (:func:`limit_velocity`), and
         ``clamped`` names the limits that were exceeded. An invalid argument (wrong shape, NaN) stops the robot, then
         raises InputError. A joint that is more than 0.1 rad away from its set-point counts as blocked: the robot makes
-        a protective stop, sets ``fault`` and does not move any more.
+        a protective stop, sets ``fault``, and no longer moves.
 
         Args:
             velocity: joint velocities, shape (n_joints,) [rad/s].

@@ -160,7 +160,7 @@ def demonstrations_by(motion: Motion, teachers: int, *, repeats: int = REPEATS) 
 
     Args:
         motion: motion to demonstrate.
-        teachers: number of teachers; the first of ten teachers is the same person as a single teacher.
+        teachers: number of teachers; a single teacher is the same person as the first of several teachers.
         repeats: number of demonstrations by each teacher.
 
     Raises:

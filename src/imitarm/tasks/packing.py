@@ -101,14 +101,14 @@ class PackingTask:
         return Pose(np.array([cube[0], cube[1], 0.5 * _SIDE]), np.array(LOOKING_DOWN))
 
     def box_at(self, time: float) -> Array:
-        """Return the middle of the box's bottom, on its inside, shape (3,) [m], at a time [s]."""
+        """Return the middle of the inner side of the box's bottom at ``time`` [s], shape (3,) [m]."""
         rng = np.random.default_rng([561, self.seed])
         period, angle = rng.uniform(*_BOX_PERIOD), rng.uniform(0.0, 2.0 * np.pi)
         travel = _BOX_TRAVEL * np.sin(2.0 * np.pi * time / period + angle) if self.moving else 0.0
         return np.array([_BOX_AT[0] + travel, _BOX_AT[1], _THICK])
 
     def bottle_at(self, time: float) -> Array:
-        """Return the centre of the bottle, shape (3,) [m], at a time [s]."""
+        """Return the centre of the bottle at ``time`` [s], shape (3,) [m]."""
         course = _pushes(self.seed)
         x, y = course(np.clip(time, 0.0, _LONGEST) if self.moving else 0.0)
         return np.array([x, y, 0.5 * _BOTTLE[1]])

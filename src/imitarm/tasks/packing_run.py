@@ -118,7 +118,7 @@ def run_packing(
 
 
 def sensed(task: PackingTask, robot: SimulatedRobot) -> TrackedScene:
-    """Observe box and bottle with a simulated sensor (5 mm noise, 30 Hz, 33 ms) and a tracker."""
+    """Observe box and bottle with a simulated sensor (noise 5 mm, 30 Hz, latency 33 ms) and a tracker."""
     del robot
     return TrackedScene(task.truth(), SensorModel(seed=task.seed), ObstacleTracker())
 
@@ -147,7 +147,7 @@ class PackingDetector(ObstacleDetector):
         self._task, self._box = task, targets[BOX]
 
     def detect(self, frame: DepthFrame | PointCloud, q: ArrayLike | None = None) -> list[Detection]:
-        """Return the cube, the bottle and the box in one image."""
+        """Return the detections of cube, bottle and box in one image."""
         found = [detection for detection in super().detect(frame, q) if detection.label != BOX]
         if isinstance(frame, DepthFrame) and frame.color is not None:
             points = frame.points()

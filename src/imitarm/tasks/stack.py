@@ -204,10 +204,15 @@ class StackTask:
     def evaluate(self, robot: SimulatedRobot, history: CubeHistory) -> StackEvaluation:  # noqa: PLR0911 (one for each kind of failure)
         """Return success, or the first failure that applies.
 
-        Failures are checked in this order: the robot has made a protective stop; the tower had more cubes before; a
-        cube left the gripper in the air and is not in the tower; a cube was put down outside the tower; a cube that was
-        never lifted turned over or was pushed; the next cube was never lifted; the time limit was reached without any
-        of these failures.
+        Failures are checked in this order:
+
+        * The robot has made a protective stop.
+        * The tower had more cubes before.
+        * A cube left the gripper in the air and is not in the tower.
+        * A cube was put down outside the tower.
+        * A cube that was never lifted turned over or was pushed.
+        * The next cube was never lifted.
+        * The time limit was reached without any of these failures.
         """
         n = self.stacked(robot)
         if self.standing(robot):

@@ -170,8 +170,8 @@ def draw_person(server: Any, person: PersonMark) -> list[Mover]:
     """Draw a person in the pose of the first frame, and return all pieces that move, appear or disappear.
 
     Every bone is rigid, with its median length over all frames. The pieces are not sent to viser as one batch. A batch
-    would need fewer messages, but the browser builds a batch asynchronously. With a batch, the person could show a
-    different frame than the robot after a jump in time.
+    would need fewer messages, but the browser builds a batch asynchronously. After a jump in time, a batch could
+    therefore show the person and the robot in different frames.
     """
     movers = []
     for piece in _pieces(person):

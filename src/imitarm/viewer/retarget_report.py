@@ -52,7 +52,7 @@ _WORDS: Final = {
     "Frames beyond a limit": "Control periods in which a joint exceeds a limit of position, velocity or "
     "acceleration. The numbers are computed from the commanded joint positions, which the drives of a real arm would "
     "have to execute.",
-    "Smallest singular value": "How fast the tool moves, at least, in relation to the joints. If the "
+    "Smallest singular value": "The smallest ratio of tool speed to joint speed, over all directions of motion. If the "
     "value is near 0, the arm is almost stretched or folded, and small motions of the tool need fast motions of the "
     "joints.",
     "Torque": "The torque that the motion needs, computed by inverse dynamics without friction. The weight "
@@ -224,7 +224,7 @@ def playback(report: RetargetReport, method: MethodResult, *, dark: bool = False
     Args:
         report: report with the person and the scene.
         method: result with the motion of the robot.
-        dark: dark controls and background.
+        dark: whether controls and background are dark.
     """
     run = method.run
     recording = retargeting_frames(run, report.scene)

@@ -233,8 +233,8 @@ class AdaptiveControl(BaselineRetargeter):
     (:class:`JointPlant`). The joint positions that the simulated arm reaches are the command to the robot. The method
     tracks joint angles, so the tool and the hand are at different positions.
 
-    Unless ``velocity_scaling`` is True, only the torque limits restrict the joint velocity. ``notes`` has these
-    entries:
+    Unless ``velocity_scaling`` is True, only the torque limits restrict the joint velocity. The dictionary ``notes``
+    has three entries.
 
     * ``"saturated"``: number of times that a joint reached its rated torque, over all joints and control steps;
     * ``"peak_torque"``: largest torque before limiting, as a multiple of the rated torque;
@@ -242,7 +242,7 @@ class AdaptiveControl(BaselineRetargeter):
 
     Args:
         arm: the robot's arm with its tool.
-        correspondence: correspondence between the person's arm and the robot's.
+        correspondence: how the person's motion maps to the robot: side, sensor pose, scale and orientation.
         dt: control period T [s].
         scene: ignored.
         velocity_scaling: whether to scale every step of the reference and of the command so that no joint exceeds its

@@ -38,7 +38,7 @@ class BaselineRetargeter(Retargeter):
 
     Args:
         arm: the robot's arm with its tool.
-        correspondence: correspondence between the person's arm and the robot's.
+        correspondence: how the person's motion maps to the robot: side, sensor pose, scale and orientation.
         dt: control period [s].
         scene: ignored.
         velocity_scaling: whether to scale every step as a whole so that no joint exceeds its velocity limit.

@@ -107,7 +107,7 @@ def engagements(
 
     Args:
         frames: frames in order of time.
-        correspondence: correspondence between the person's arm and the robot's.
+        correspondence: how the person's motion maps to the robot: side, sensor pose, scale and orientation.
         rule: times at which the engagement changes its state.
     """
     estimator, engagement = ArmEstimator(correspondence), Engagement(correspondence, rule)

@@ -192,7 +192,7 @@ class ThesisRetargeter(Retargeter):
 
     Args:
         arm: the robot's arm with its tool.
-        correspondence: correspondence between the person's arm and the robot's.
+        correspondence: how the person's motion maps to the robot: side, sensor pose, scale and orientation.
         dt: control period [s].
         scene: ignored.
         small_angle: None: damping as in Eq 3.9; ``"thesis"``: damping with the small-angle term that the thesis prints
