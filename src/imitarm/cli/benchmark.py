@@ -104,7 +104,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--data",
         type=Path,
         metavar="DIR",
-        help="folder of real recordings; adds the motion capture of a real person's arm to the recordings",
+        help="folder of real recordings; with this option, the methods also run on motion capture of a real arm",
     )
     mapping.add_argument("--out", type=Path, metavar="DIR", help="folder of the results; default: benchmark-mapping")
     mapping.add_argument("--report", type=Path, metavar="FILE", help="write a page with figures and playback (HTML)")

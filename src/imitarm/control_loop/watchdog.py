@@ -13,8 +13,8 @@ from imitarm.validation import finite_number, flag
 class Watchdog:
     r"""Slows the arm down and stops it while the sensor is frozen or silent.
 
-    The ``stamp`` of a scene is the time at which the scene was measured. Let a be the time since the last scene with a
-    new, later stamp arrived. The watchdog multiplies the command by
+    The ``stamp`` of a scene is the time at which the scene was measured. Let a be the time that has passed since a
+    scene with a new stamp last arrived. The watchdog multiplies the command by
 
     .. math:: f(a) = \min\Big(1,\; \max\Big(0,\; \frac{a_{stop} - a}{a_{stop} - a_{slow}}\Big)\Big) .
 

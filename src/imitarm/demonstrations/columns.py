@@ -430,7 +430,7 @@ def order_notes(options: ReadOptions, said: SaidUnits | None = None) -> tuple[st
 
 
 def with_units(raw: RawDemonstration, options: ReadOptions, length: str | None, time: str | None) -> RawDemonstration:
-    """Record the units from which a demonstration was converted; ``length`` and ``time`` are those in the file."""
+    """Store the units of the file in a demonstration; ``length`` and ``time`` are units that the file itself states."""
     stated = tuple(kind for kind, unit in (("length", length), ("time", time)) if unit is not None)
     return replace(
         raw,

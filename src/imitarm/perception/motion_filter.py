@@ -377,7 +377,8 @@ def updated(
 ) -> tuple[Array, Array, Indices, Array] | None:
     """Predict and update all tracks by compiled code; None without this code, or if the assignment is not obvious.
 
-    It computes the same as :meth:`MotionFilter.predict`, ``assign`` and :meth:`MotionFilter.update`.
+    The compiled code computes the same values as :meth:`MotionFilter.predict`, ``assign`` and
+    :meth:`MotionFilter.update`.
 
     Args:
         mean: states of n tracks, each with s components, shape (n, 1, s).

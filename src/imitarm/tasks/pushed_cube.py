@@ -1,4 +1,4 @@
-"""run_pushed_cube: a Panda sweeps with RCAMO while a cube, seen by a sensor or a camera, is pushed into its way."""
+"""run_pushed_cube: a Panda sweeps with the policy RCAMO while a cube is pushed into the way of the brush."""
 
 from __future__ import annotations
 
@@ -60,9 +60,9 @@ class _Push(NamedTuple):
 def pushed_cube(seed: int, skill: Skill) -> MovingScene:
     """Return a scene in which a cube is pushed onto the path of the sweep twice (thesis Fig 5.5).
 
-    One push comes before the dirt and one behind it, so that the cube never pushes the dirt itself. Size, side,
-    places, times and speeds of the pushes are random. The cube stands still on the path for a while, and is pulled back
-    afterwards.
+    The first push is onto the part of the path before the dirt, the second onto the part behind it, so that the cube
+    never moves the dirt. Size, side, places, times and speeds of the pushes are random. The cube stands still on the
+    path for a while, and is pulled back afterwards.
 
     Args:
         seed: seed of the random numbers.
@@ -103,12 +103,12 @@ def _track(pushes: list[_Push], outside: list[Array], height: float) -> Track:
 
 @lru_cache(maxsize=1)
 def learned_sweep() -> Skill:
-    """Return the skill that the packaged demonstrations of the sweep show."""
+    """Return the skill that is learned from the packaged demonstrations of the sweep."""
     return Skill().fit(align(read(DEMONSTRATIONS)))
 
 
 def sweeping_rcamo(skill: Skill, task: SweepTask) -> RCAMO:
-    """Return RCAMO for the sweep: the brush stays on the table, and evades only to the left and to the right."""
+    """Return the policy RCAMO for the sweep: the brush stays on the table, and evades only to the left or right."""
     return RCAMO(
         skill,
         tool_spheres=[[0.0, 0.0, 0.0, task.tool_radius]],
@@ -133,7 +133,7 @@ def run_pushed_cube(
         arm: the arm with the brush, if it has been loaded already; None: the Panda.
         observer: function that returns the ``observe`` of :func:`~imitarm.control_loop.reproduce` for the true scene,
             the simulated robot and the seed, see :data:`CUBE_OBSERVERS`; None: :func:`sensed_cube`.
-        on_step: called after each step.
+        on_step: function called after each control step.
 
     Returns:
         The measured motion, evaluated by :meth:`SweepTask.evaluate`.
@@ -156,7 +156,7 @@ def run_pushed_cube(
 
 
 def sensed_cube(truth: MovingScene, robot: SimulatedRobot, seed: int) -> Callable[[float], Scene]:
-    """Observe the cube with a simulated sensor (5 mm noise, 30 Hz, 33 ms) and a tracker."""
+    """Observe the cube with a simulated sensor (noise 5 mm, 30 Hz, latency 33 ms) and a tracker."""
     del robot
     return TrackedScene(truth, SensorModel(seed=seed), ObstacleTracker())
 

@@ -227,7 +227,7 @@ class SweepTask:
 
 
 def table_top() -> Box:
-    """Return the table top as an obstacle; a camera sees past its edges."""
+    """Return the table top as a box, because the table has edges, past which a camera sees the floor."""
     place = Pose(np.array([*TABLE_CENTER, -0.5 * TABLE_SIZE[2]]), np.array([1.0, 0.0, 0.0, 0.0]))
     return Box(place, np.array(TABLE_SIZE), name="table")
 
