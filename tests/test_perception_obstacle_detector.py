@@ -142,7 +142,7 @@ def test_an_empty_image_has_no_obstacles():
         ({"arm": "sawyer"}, "arm must be a ArmModel"),
         ({"surfaces": [1]}, "fixtures"),
         ({"workspace": ((1, 1, 1), (0, 0, 0))}, "lowest and the highest corner"),
-        ({"depth_range": (5.0, 0.5)}, "depth_range must increase"),
+        ({"depth_range": (5.0, 0.5)}, "depth_range must be two increasing"),
         ({"noise": 0.01}, "noise"),
         ({"voxel": 0.0}, "voxel"),
         ({"min_points": 0}, "min_points"),
