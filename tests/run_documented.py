@@ -1,0 +1,122 @@
+"""Run every command in the code blocks of README.md and docs/, and print how each of them ended.
+
+``python tests/run_documented.py [PAGE ...] [--seconds 180] [--data FOLDER]`` copies the committed files to a temporary
+folder and runs the commands of each page there, in order. A command that takes longer than ``--seconds`` is stopped and
+counts as running. The exit status is 1 if a command failed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+BLOCK = re.compile(r"^```(?:sh|bash|console)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+COMMAND = re.compile(r"(?:\w+=\S+ )*(?:\.venv/bin/)?(?:imitarm|python|make|pip) ")
+SKIPPED = re.compile(r"make (demo|test|quick|mediapipe|install)\b|pip install")  # they install packages
+SCENE = """\
+format: imitarm-scene
+version: 1
+obstacles:
+  - {type: sphere, name: ball, center: [0.75, 0.5, 0.3], radius: 0.05, velocity: [0, -0.05, 0]}
+"""
+"""A file that ``docs/chapter_5.md`` and ``docs/retargeting.md`` assume; the readers have their own."""
+
+
+def commands(page: Path) -> Iterator[str]:
+    """Yield the commands in the code blocks of ``page``, without their comments."""
+    for block in BLOCK.findall(page.read_text(encoding="utf-8")):
+        for line in block.replace("\\\n", " ").splitlines():
+            command = re.sub(r"\s+#.*", "", " ".join(line.split()))
+            if COMMAND.match(command):
+                yield command
+
+
+def prepare(folder: Path, data: Path, environment: dict[str, str]) -> None:
+    """Copy the committed files to ``folder``, and make the files that the pages assume."""
+    archive = subprocess.run(["git", "archive", "HEAD"], cwd=ROOT, check=True, capture_output=True).stdout
+    subprocess.run(["tar", "-x", "-C", str(folder)], input=archive, check=True)
+    (folder / ".venv" / "bin").mkdir(parents=True)
+    for program in ("python", "imitarm"):
+        (folder / ".venv" / "bin" / program).symlink_to(Path(sys.executable).with_name(program))
+    if (ROOT / ".cache").exists():
+        (folder / ".cache").symlink_to(ROOT / ".cache")
+    if not data.exists():
+        return
+    (folder / "recordings").symlink_to(data / "panda_kinesthetic")
+    for name in ("pouring", "letter_h", "bottle2shelf", "letter_e"):
+        shutil.copy(data / "panda_kinesthetic" / f"{name}.npy", folder)
+        learn = f"imitarm learn {name}.npy --units cm --duration 10 --task {name} --out {name}.json"
+        subprocess.run(shlex.split(learn), cwd=folder, env=environment, check=True, capture_output=True)
+    sweep = "imitarm learn src/imitarm/tasks/data/sweep/demonstrations --task sweep --out sweep.json"
+    subprocess.run(shlex.split(sweep), cwd=folder, env=environment, check=True, capture_output=True)
+    for name in ("moving", "cups"):
+        (folder / f"{name}.yaml").write_text(SCENE, encoding="utf-8")
+
+
+def run(command: str, folder: Path, environment: dict[str, str], seconds: float) -> tuple[str, str]:
+    """Run one command; return how it ended, and the last line that it printed."""
+    if SKIPPED.match(command):
+        return "skipped", "installs packages"
+    began = time.monotonic()
+    with (folder / "output.txt").open("w+", encoding="utf-8") as output:
+        process = subprocess.Popen(
+            command, shell=True, cwd=folder, env=environment, stdout=output, stderr=output, start_new_session=True
+        )
+        try:
+            status = process.wait(timeout=seconds)
+        except subprocess.TimeoutExpired:
+            status = None
+            os.killpg(process.pid, signal.SIGTERM)
+            try:
+                process.wait(timeout=10.0)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+    lines = (folder / "output.txt").read_text(encoding="utf-8", errors="replace").split("\n")
+    last = next((line.strip() for line in reversed(lines) if line.strip()), "")
+    ended = "running" if status is None else "done" if status == 0 else f"FAILED ({status})"
+    return f"{ended}, {time.monotonic() - began:.0f} s", last
+
+
+def main() -> int:
+    """Run the commands; return 1 if one failed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("pages", nargs="*", help="names such as README.md or skills.md; default: all")
+    parser.add_argument("--seconds", type=float, default=180.0, help="longest time for one command")
+    parser.add_argument("--data", type=Path, default=Path(os.environ.get("IMITARM_DATA", ROOT.parent / "shared/data")))
+    arguments = parser.parse_args()
+    pages = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    bad = 0
+    for page in pages:
+        if arguments.pages and page.name not in arguments.pages:
+            continue
+        if not list(commands(page)):
+            continue
+        with tempfile.TemporaryDirectory() as name:
+            folder, data = Path(name) / "imitarm", arguments.data.resolve()
+            folder.mkdir()
+            (Path(name) / "shared").mkdir()
+            (Path(name) / "shared" / "data").symlink_to(data)
+            environment = os.environ | {"DATA": str(data), "MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1"}
+            environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{environment['PATH']}"
+            prepare(folder, data, environment)
+            for command in commands(page):
+                ended, last = run(command, folder, environment, arguments.seconds)
+                bad += "FAILED" in ended
+                print(f"{page.name}\t{ended}\t{command}\t{last[:160]}", flush=True)
+    return int(bad > 0)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
