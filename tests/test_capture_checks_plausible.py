@@ -182,6 +182,19 @@ def test_an_arm_that_is_frozen_while_the_body_moves_is_found_and_lost():
     assert len(mended) == 120 and not mended.skeletons[70].arm("right").seen and mended.skeletons[70].arm("left").seen
 
 
+@pytest.mark.parametrize("part", ["elbow", "wrist"])
+def test_one_joint_that_is_frozen_while_the_arm_moves_is_found(part):
+    frames = skeletons(120, seed=4)
+    joint = JOINT[f"{part}_right"]
+    for i in range(41, 100):
+        positions = np.array(frames[i].positions)
+        positions[joint] = frames[40].positions[joint]
+        frames[i] = changed(frames[i], positions=positions)
+    issue = issues(frames)["frozen"]
+    assert issue.severity == "error" and issue.frame == 40 and f"right {part}" in issue.message
+    assert "record again" in issue.remedy
+
+
 def test_frames_that_all_come_twice_are_a_warning_with_the_true_rate():
     frames = [s for s in skeletons(60, rate=15.0) for _ in range(2)]
     frames = [changed(s, time=i / 30.0) for i, s in enumerate(frames)]

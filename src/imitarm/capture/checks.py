@@ -290,7 +290,11 @@ def _gaps(view: _View) -> Iterator[RecordingIssue]:
 
 def _frozen(view: _View) -> Iterator[RecordingIssue]:
     whole, arm = repeats_previous(view.positions), repeats_previous(view.positions[:, _ARM[view.side]])
-    for what, repeated in (("person", whole), (f"{view.side} arm", arm)):
+    joints = {
+        f"{view.side} {part}": repeats_previous(view.positions[:, [JOINT[f"{part}_{view.side}"]]])
+        for part in ("elbow", "wrist")
+    }
+    for what, repeated in {"person": whole, f"{view.side} arm": arm, **joints}.items():
         lasting = [
             (view.times[b] - view.times[a], a) for a, b in runs(repeated) if view.times[b] - view.times[a] > _GAP
         ]
@@ -302,10 +306,12 @@ def _frozen(view: _View) -> Iterator[RecordingIssue]:
                     f"in {len(lasting)} periods, the positions of the {what} are exactly the same; "
                     f"the longest period lasts {longest:.2f} s"
                 )
-            remedy = (
-                "repair the recording to drop these frames, which leaves a gap; record again if you need the motion in "
-                "the gap"
-            )
+            remedy = "record again: the other joints move, so the sensor lost this joint"
+            if what not in joints:
+                remedy = (
+                    "repair the recording to drop these frames, which leaves a gap; record again if you need the "
+                    "motion in the gap"
+                )
             yield view.issue("error" if longest > _STOP else "warning", "frozen", message, remedy, first)
             return
     fraction = whole.sum() / len(view.times)
