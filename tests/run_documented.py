@@ -58,7 +58,7 @@ def prepare(folder: Path, data: Path, environment: dict[str, str]) -> None:
         shutil.copy(data / "panda_kinesthetic" / f"{name}.npy", folder)
         learn = f"imitarm learn {name}.npy --units cm --duration 10 --task {name} --out {name}.json"
         subprocess.run(shlex.split(learn), cwd=folder, env=environment, check=True, capture_output=True)
-    sweep = "imitarm learn src/imitarm/tasks/data/sweep/demonstrations --task sweep --out sweep.json"
+    sweep = "imitarm learn src/imitarm/tasks/data/sweep --task sweep --out sweep.json"
     subprocess.run(shlex.split(sweep), cwd=folder, env=environment, check=True, capture_output=True)
     for name in ("moving", "cups"):
         (folder / f"{name}.yaml").write_text(SCENE, encoding="utf-8")
