@@ -24,6 +24,7 @@ ROOT = Path(__file__).parents[1]
 BLOCK = re.compile(r"^```(?:sh|bash|console)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 COMMAND = re.compile(r"(?:\w+=\S+ )*(?:\.venv/bin/)?(?:imitarm|python|make|pip) ")
 SKIPPED = re.compile(r"make (demo|test|quick|mediapipe|install)\b|pip install")  # they install packages
+
 SCENE = """\
 format: imitarm-scene
 version: 1
@@ -31,6 +32,10 @@ obstacles:
   - {type: sphere, name: ball, center: [0.75, 0.5, 0.3], radius: 0.05, velocity: [0, -0.05, 0]}
 """
 """A file that ``docs/chapter_5.md`` and ``docs/retargeting.md`` assume; the readers have their own."""
+
+
+PAIRS = [(0.1, 0.2, 2.0), (0.4, -0.1, 2.1), (-0.2, 0.3, 1.8), (0.0, -0.3, 2.4), (0.3, 0.3, 2.2)]
+"""Points in the sensor's frame; the base is 2.5 m away and faces the sensor."""
 
 
 def commands(page: Path) -> Iterator[str]:
@@ -51,6 +56,9 @@ def prepare(folder: Path, data: Path, environment: dict[str, str]) -> None:
         (folder / ".venv" / "bin" / program).symlink_to(Path(sys.executable).with_name(program))
     if (ROOT / ".cache").exists():
         (folder / ".cache").symlink_to(ROOT / ".cache")
+    rows = [f"{x},{y},{z},{2.5 - z},{-x},{y + 1.0}" for x, y, z in PAIRS]
+    names = "sensor_x,sensor_y,sensor_z,base_x,base_y,base_z"
+    (folder / "pairs.csv").write_text("\n".join([names, *rows, ""]), encoding="utf-8")
     if not data.exists():
         return
     (folder / "recordings").symlink_to(data / "panda_kinesthetic")

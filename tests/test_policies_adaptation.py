@@ -41,6 +41,22 @@ def test_unknown_method_lists_the_known_ones(spatial):
         adapt(spatial[0], Scene(), "magic", tool_radius=0.0)
 
 
+def test_a_refusal_names_both_clearances_so_that_they_differ(spatial):
+    """Just under the required clearance, and a required clearance below one millimetre."""
+    goal = spatial[0].goal_.position
+    for required, short in ((0.02, 4e-4), (0.0004, 3e-4)):
+        ball = Sphere(goal + [0.0, 0.0, 0.05 + required - short], 0.05)
+        reason = adapt(spatial[0], Scene(None, [ball]), tool_radius=0.0, clearance=required).reason
+        assert f"leaves {1e3 * (required - short):.1f} mm of clearance at the goal ({1e3 * required:g} mm req" in reason
+
+
+def test_a_refusal_says_that_a_rotating_obstacle_counts_as_a_sphere(spatial):
+    goal = spatial[0].goal_
+    blade = Box(Pose(goal.position + [0.0, 0.0, 0.1], [1, 0, 0, 0]), [0.4, 0.02, 0.02], angular_velocity=[0, 0, 1.0])
+    reason = adapt(spatial[0], Scene(None, [blade]), tool_radius=0.0).reason
+    assert "box 1 (it rotates, so it counts as a sphere that contains it) covers the goal" in reason
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

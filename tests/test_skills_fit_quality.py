@@ -77,6 +77,36 @@ def test_too_few_components_for_the_motion_are_a_problem_with_a_remedy() -> None
     assert quality.problem.count("of the motion's extent") == 1
 
 
+def wave(bends: float, size: float, *, noise: float = 0.0) -> list[Demonstration]:
+    """A straight motion over 0.6 m with small loops on it, as in sanding or sewing."""
+    t, rng = np.linspace(0.0, 20.0, 1000), np.random.default_rng(3)
+    angle = 2.0 * np.pi * bends * t / 20.0
+    x = np.column_stack([0.6 * t / 20.0, size * np.sin(angle), size * np.cos(angle)]) + [0.4, 0.0, 0.2]
+    return [Demonstration(Trajectory(t, x + noise * rng.normal(size=x.shape)), source=f"file {i}") for i in range(3)]
+
+
+@pytest.mark.parametrize(("bends", "size"), [(20.0, 0.02), (12.0, 0.03), (25.0, 0.025)])
+def test_small_loops_on_a_long_motion_are_learned(bends: float, size: float) -> None:
+    quality = Skill().fit(wave(bends, size)).fit_quality_
+    assert quality is not None and quality.faithful
+    assert quality.length > 0.9
+    assert quality.bias < 0.35 * size
+
+
+def test_a_path_that_has_lost_the_bends_is_a_problem_although_it_is_near() -> None:
+    with pytest.warns(PoorFitWarning, match=r"lost bends of the motion: it is \d+ % as long .*use more than 12 comp"):
+        skill = Skill(12).fit(wave(20.0, 0.02))
+    quality = skill.fit_quality_
+    assert quality is not None and not quality.faithful
+    assert quality.bias < 0.05 * quality.extent and quality.length < 0.6
+    assert "root mean square" not in quality.problem and "at most 5 %" not in quality.problem
+
+
+def test_noise_does_not_count_as_bends() -> None:
+    quality = Skill(6).fit(wave(0.5, 0.02, noise=1e-3)).fit_quality_
+    assert quality is not None and quality.faithful and 0.95 < quality.length < 1.05
+
+
 @pytest.mark.parametrize("number", [6.0, 10.5])
 def test_the_period_is_found_with_a_drift_and_a_broken_last_loop(number: float) -> None:
     quality = poor(4, loops(number, drift=0.3)).fit_quality_

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -147,17 +148,17 @@ def jerk_reason(scene: Scene, detour: Detour, ratio: float, clearance: float) ->
 def refusal(scene: Scene, problem: AvoidanceProblem, detour: Detour, method: str, adapter: PathAdapter) -> str:
     """Return a message that says which obstacle can't be avoided, why, and what to change."""
     path, k = problem.path, problem.nominal.tool.n_spheres
-    required = f"{1e3 * problem.clearance:.0f} mm required"
+    required = f"{1e3 * problem.clearance:.3g} mm required"
     if any(margin is not None for margin in problem.nominal.tool.margins):
         required += " beyond the margin for its prediction"
     fixed = path.fixed
     at_fixed = problem.nominal.distance[:, fixed]
     if at_fixed.min(initial=np.inf) < problem.clearance:
         pair, i = np.unravel_index(int(np.argmin(at_fixed)), at_fixed.shape)
-        return _at_fixed(path, scene.name_of(pair // k), int(fixed[i]), float(at_fixed.min()), required)
+        return _at_fixed(path, _name(scene, int(pair) // k), int(fixed[i]), float(at_fixed.min()), required)
     worst = int(np.argmin(detour.bounds))
-    name = scene.name_of(worst // k)
-    left = f"{1e3 * float(detour.bounds[worst]) + 0.0:.1f} mm"
+    name = _name(scene, worst // k)
+    left = _millimetres(float(detour.bounds[worst]))
     if not adapter.refuses:
         return (
             f"the path passes {name} at a distance of {left} ({required}): method {method!r} pushes components and "
@@ -189,11 +190,22 @@ def refusal(scene: Scene, problem: AvoidanceProblem, detour: Detour, method: str
     return "; ".join(filter(None, clauses))
 
 
+def _name(scene: Scene, i: int) -> str:
+    """Return the name of an obstacle for a message, which says how a rotating obstacle is treated."""
+    turning = scene.obstacles[i].angular_velocity.any()
+    return scene.name_of(i) + (" (it rotates, so it counts as a sphere that contains it)" if turning else "")
+
+
+def _millimetres(length: float) -> str:
+    """Return a length in millimetres, rounded down, so that a clearance below the required one looks like less."""
+    return f"{math.floor(1e4 * length + 1e-6) / 10.0 + 0.0:.1f} mm"
+
+
 def _at_fixed(path: ComponentPath, name: str, sample: int, left: float, required: str) -> str:
     """Return a message which says that an obstacle is too close to a point that must not move."""
     at, end = path.nominal.times[sample], path.nominal.times[-1]
     where = "start" if at < 0.02 * end else "goal" if at > 0.98 * end else f"pinned point at {at:.2f} s"
-    gap = f"leaves {1e3 * left:.0f} mm of clearance at the {where} ({required})"
+    gap = f"leaves {_millimetres(left)} of clearance at the {where} ({required})"
     lies = f"covers the {where}" if left <= 0.0 and required.endswith("required") else gap
     other = where if where in {"start", "goal"} else "pinned time"
     return f"{name} {lies}; this point must not move: move the obstacle, or choose another {other}"

@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from imitarm.kinematics.pose import quaternion_conjugate, quaternion_log, quaternion_multiply
 from imitarm.skills.dmp import DMP
 from imitarm.skills.gmr import GMR
+from imitarm.skills.path_length import relative_length
 from imitarm.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
 LARGEST_BIAS = 0.05  # of the motion's extent: a skill with a larger bias does not reproduce the motion
+LEAST_LENGTH = 0.8  # of the length of the average motion: a skill with a shorter path has lost bends
 _NO_BIAS = 0.0005, float(np.deg2rad(1.0))  # [m], [rad] a bias that is never too large: motions that hardly move
 _ROUNDING = 1e-9  # [m]
 _FEWEST, _MOST = 200, 2000  # times at which a fit is compared
@@ -51,7 +53,8 @@ class FitQuality:
 
     The bias is the root mean square distance between the skill and the average of the demonstrations at the same times.
     Differences between demonstrations do not count as bias; they are the skill's tolerance. A skill with a bias above 5
-    % of the motion's extent is not :attr:`faithful`.
+    % of the motion's extent is not :attr:`faithful`. A skill whose path is much shorter than the average motion is not
+    faithful either, because it has lost bends.
 
     Attributes:
         distances: distances of the nominal path to each demonstration.
@@ -62,6 +65,8 @@ class FitQuality:
         rotation_extent: largest angle between the average rotation and its start [rad]; 0 without rotations.
         rotation_bias: bias of the nominal rotation [rad]; 0 without rotations.
         period: time after which the motion repeats [s]; None when it repeats less than three times.
+        length: length of the nominal path, divided by the length of the average motion. Bends that are smaller than 2 %
+            of the extent are left out of both lengths.
     """
 
     distances: tuple[DemonstrationDistance, ...]
@@ -72,6 +77,7 @@ class FitQuality:
     rotation_extent: float = 0.0
     rotation_bias: float = 0.0
     period: float | None = None
+    length: float = 1.0
 
     @property
     def relative_bias(self) -> float:
@@ -83,7 +89,10 @@ class FitQuality:
 
     @property
     def faithful(self) -> bool:
-        """Whether every bias is at most 5 % of the motion's extent; biases up to 0.5 mm and 1 degree always pass."""
+        """Whether every bias is at most 5 % of the motion's extent, and the path at least 80 % as long as the motion.
+
+        Biases up to 0.5 mm and 1 degree always pass.
+        """
         return not self.problem
 
     @property
@@ -97,6 +106,11 @@ class FitQuality:
                     f"the {name} is {1e3 * bias:.1f} mm (root mean square) from the average of the demonstrations, "
                     f"{self._percent(bias, self.extent)} of the motion's extent"
                 )
+        if self.length < LEAST_LENGTH and self.bias > _NO_BIAS[0] and not texts:
+            texts.append(
+                f"the nominal path has lost bends of the motion: it is {100.0 * self.length:.0f} % as long as the "
+                f"average demonstration (at least {100 * LEAST_LENGTH:g} %)"
+            )
         if self.rotation_bias > max(LARGEST_BIAS * self.rotation_extent, _NO_BIAS[1]):
             texts.append(
                 f"the rotation is {np.rad2deg(self.rotation_bias):.1f} degrees (root mean square) from the average of "
@@ -108,7 +122,8 @@ class FitQuality:
         remedy = f"use more than {self.n_components} components, or cut long recordings into shorter motions"
         if self.period is not None:
             remedy += f"; {self.suggestion}"
-        return f"{' and '.join(texts)} (at most {100 * LARGEST_BIAS:g} %): {remedy}"
+        limit = f" (at most {100 * LARGEST_BIAS:g} %)" if "root mean square" in texts[-1] else ""
+        return f"{' and '.join(texts)}{limit}: {remedy}"
 
     @property
     def suggestion(self) -> str:
@@ -154,15 +169,17 @@ def evaluate_fit(gmr: GMR, dmp: DMP, trajectories: Sequence[Trajectory], sources
         q = gmr.reference_.to_quaternions(grid, vectors)
         angles = np.linalg.norm(quaternion_log(quaternion_multiply(q, quaternion_conjugate(q[:1]))), axis=1)
         rotation_extent = float(angles.max())
+    extent = float(np.linalg.norm(np.ptp(average, axis=0)))
     return FitQuality(
         tuple(distances),
         gmr.n_components_,
-        float(np.linalg.norm(np.ptp(average, axis=0))),
+        extent,
         _rms(nominal - average),
         _rms(primitive - average),
         rotation_extent,
         rotation_bias,
         _period(grid, average),
+        relative_length(nominal, average),
     )
 
 

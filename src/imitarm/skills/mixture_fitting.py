@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.errors import InputError
+from imitarm.skills.path_length import relative_length, turning
 
 Array = NDArray[np.float64]
 LOG_2PI = float(np.log(2.0 * np.pi))
@@ -38,7 +39,8 @@ _EVEN = 0.05  # weight of the squared lengths; a sample costs about 10. It makes
 _NOTHING = -45.0  # exp(-45) vanishes beside 1 in double precision; np.exp is slow for much smaller numbers
 NUMBERS = tuple(range(2, 17))
 MORE_NUMBERS = (20, 25, 32, 40, 50, 64, 80, 100, 128)  # tried while the bias is large: long motions with many bends
-_SAMPLES = 100  # per demonstration, for a motion whose path is up to 3 times its extent; in proportion for longer paths
+_SAMPLES = 100  # per demonstration, for a path up to 3 times as long as its extent that turns by up to 3 circles
+_TURNING = 6.0 * np.pi  # [rad]
 _MOST_SAMPLES = 1000
 _HELD_OUT = 1.02  # times the smallest held-out error
 _BIAS = 0.1  # of the smallest held-out error
@@ -47,6 +49,7 @@ _LEVER = 0.1  # [m] where only the rotation moves, errors are those of a point a
 _SLACK_MM = 0.1  # below the repeatability of industrial arms
 _PATIENCE = 4  # stop after so many numbers in a row without a smaller held-out error
 _BETTER = 0.995  # times the smallest so far
+_LENGTH = 0.95  # of the motion's length: below it, more numbers are tried
 _LARGE_BIAS = 0.01  # of the motion's extent: above it, more numbers are tried
 
 
@@ -350,7 +353,8 @@ def try_numbers_of_components(
         numbers: numbers K of components to try.
         min_std: smallest standard deviations that count as motion, one per column.
         reg_covar: smallest eigenvalue of a covariance relative to the variances of the columns.
-        more: further numbers to try, in this order, while every bias so far is above 1 % of the motion's extent.
+        more: further numbers to try, in this order, while every bias so far is above 1 % of the motion's extent, or
+            every learned path is shorter than 95 % of the motion.
 
     Raises:
         InputError: when there are fewer samples than the smallest number of components.
@@ -385,6 +389,8 @@ def try_numbers_of_components(
     size = 1e3 * lever * scale[places]  # back to mm
     extent = float(np.linalg.norm(np.ptp(plain_mean * size, axis=0)))
 
+    lengths: list[float] = []
+
     def evaluate(k: int, cut: Array) -> Candidate:
         start = np.repeat(cut[None], len(seen), axis=0)
         fit = expectation_maximisation(features, start, seen, floor=reg_covar, tol=1e-3, max_iter=50)
@@ -395,7 +401,9 @@ def try_numbers_of_components(
         if len(tables) > 1:
             held_out = (_regression(fit, owner + 1, Z[:, 0], places) - Z[:, places]) * size
             error = np.sqrt(np.mean(np.sum(held_out**2, axis=1)) + 1e6 * still)
-        bias = (_regression(fit, np.zeros(len(grid), dtype=np.intp), grid, places) - plain_mean) * size
+        mean = _regression(fit, np.zeros(len(grid), dtype=np.intp), grid, places)
+        lengths.append(relative_length(mean * size, plain_mean * size))
+        bias = (mean - plain_mean) * size
         return Candidate(
             k,
             bic=-2.0 * likelihood + parameters * float(np.log(len(samples))),
@@ -410,7 +418,8 @@ def try_numbers_of_components(
         if len(tables) > 1 and _enough(evaluated):
             break
     for k in (k for k in more if 2 * k <= fewest):
-        if min(c.bias_rmse_mm for c in evaluated) <= max(_SLACK_MM, _LARGE_BIAS * extent):
+        near = min(c.bias_rmse_mm for c in evaluated) <= max(_SLACK_MM, _LARGE_BIAS * extent)
+        if near and max(lengths) >= _LENGTH:
             break
         evaluated.append(evaluate(k, responsibilities_by_segments(features, samples[:, 0], [k])[0]))
     return tuple(evaluated)
@@ -431,7 +440,7 @@ def _samples_needed(tables: Sequence[Array]) -> int:
     mean = _LEVER * mean[:, 3:] if only_rotates else mean[:, :3]
     extent = float(np.linalg.norm(np.ptp(mean, axis=0)))
     path = float(np.linalg.norm(np.diff(mean, axis=0), axis=1).sum())
-    needed = _SAMPLES * path / (3.0 * extent) if extent > 0.0 else 0.0
+    needed = _SAMPLES * max(path / (3.0 * extent), turning(mean) / _TURNING) if extent > 0.0 else 0.0
     return int(np.clip(needed, _SAMPLES, _MOST_SAMPLES))
 
 

@@ -116,6 +116,7 @@ class FitFields(msgspec.Struct, omit_defaults=True):
     rotation_extent: float
     rotation_bias: float
     period: float | None = None
+    length: float = 1.0
 
 
 class SkillDocument(msgspec.Struct, omit_defaults=True):
@@ -242,6 +243,7 @@ def fit_fields(fit: FitQuality) -> FitFields:
         fit.rotation_extent,
         fit.rotation_bias,
         fit.period,
+        fit.length,
     )
 
 
