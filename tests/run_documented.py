@@ -23,6 +23,21 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 BLOCK = re.compile(r"^```(?:sh|bash|console)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 COMMAND = re.compile(r"(?:\w+=\S+ )*(?:\.venv/bin/)?(?:imitarm|python|make|pip) ")
+BEFORE = {
+    "retargeting.md": [
+        "imitarm capture synthetic:7 --seconds 20 --out wave.csv",
+        "imitarm calibrate limbs wave.csv",
+        "imitarm calibrate sensor pairs.csv",
+        "imitarm calibrate clutch --robot panda --orientation upright",
+        *(
+            f"imitarm capture synthetic:{i} --seconds 12 --out person_{i}.csv && imitarm retarget person_{i}.csv "
+            f"--tool gripper --fit --out wave_{i}.csv"
+            for i in (1, 2, 3)
+        ),
+    ]
+}
+"""Commands of other pages whose files a page uses."""
+TOGETHER = {"transmission.md"}  # pages whose commands run at the same time, each in its own terminal
 SKIPPED = re.compile(r"make (demo|test|quick|mediapipe|install)\b|pip install")  # they install packages
 
 SCENE = """\
@@ -34,6 +49,8 @@ obstacles:
 """A file that ``docs/chapter_5.md`` and ``docs/retargeting.md`` assume; the readers have their own."""
 
 
+VIDEOS = ".cache/pose2sim"
+START_GAP = 5.0  # [s] between commands that run at the same time
 PAIRS = [(0.1, 0.2, 2.0), (0.4, -0.1, 2.1), (-0.2, 0.3, 1.8), (0.0, -0.3, 2.4), (0.3, 0.3, 2.2)]
 """Points in the sensor's frame; the base is 2.5 m away and faces the sensor."""
 
@@ -72,29 +89,45 @@ def prepare(folder: Path, data: Path, environment: dict[str, str]) -> None:
         (folder / f"{name}.yaml").write_text(SCENE, encoding="utf-8")
 
 
-def run(command: str, folder: Path, environment: dict[str, str], seconds: float) -> tuple[str, str]:
-    """Run one command; return how it ended, and the last line that it printed."""
-    if SKIPPED.match(command):
-        return "skipped", "installs packages"
+def run(together: list[str], folder: Path, environment: dict[str, str], seconds: float) -> Iterator[tuple[str, str]]:
+    """Run commands at the same time; yield how each of them ended, and the last line that it printed."""
+    outputs = [folder / f"output_{i}.txt" for i in range(len(together))]
+    processes: list[subprocess.Popen[bytes] | None] = []
     began = time.monotonic()
-    with (folder / "output.txt").open("w+", encoding="utf-8") as output:
-        process = subprocess.Popen(
-            command, shell=True, cwd=folder, env=environment, stdout=output, stderr=output, start_new_session=True
-        )
-        try:
-            status = process.wait(timeout=seconds)
-        except subprocess.TimeoutExpired:
-            status = None
-            os.killpg(process.pid, signal.SIGTERM)
-            try:
-                process.wait(timeout=10.0)
-            except subprocess.TimeoutExpired:
-                os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
-    lines = (folder / "output.txt").read_text(encoding="utf-8", errors="replace").split("\n")
-    last = next((line.strip() for line in reversed(lines) if line.strip()), "")
-    ended = "running" if status is None else "done" if status == 0 else f"FAILED ({status})"
-    return f"{ended}, {time.monotonic() - began:.0f} s", last
+    for command, output in zip(together, outputs, strict=True):
+        if SKIPPED.match(command) or (VIDEOS in command and not (folder / VIDEOS).exists()):
+            processes.append(None)
+            continue
+        time.sleep(START_GAP * (len(processes) > 0))
+        with output.open("wb") as file:
+            processes.append(
+                subprocess.Popen(
+                    command, shell=True, cwd=folder, env=environment, stdout=file, stderr=file, start_new_session=True
+                )
+            )
+    for process, output in zip(processes, outputs, strict=True):
+        if process is None:
+            yield "skipped", "installs packages, or needs the videos of 'make mediapipe'"
+            continue
+        status = ended(process, began + seconds)
+        lines = [line.strip() for line in output.read_text(encoding="utf-8", errors="replace").split("\n")]
+        last = next((line for line in reversed(lines) if line), "")
+        word = "running" if status is None else "done" if status == 0 else f"FAILED ({status})"
+        yield f"{word}, {time.monotonic() - began:.0f} s", last
+
+
+def ended(process: subprocess.Popen[bytes], until: float) -> int | None:
+    """Wait for a process, and stop it at the time ``until``; return its exit status, or None if it was stopped."""
+    try:
+        return process.wait(timeout=max(0.1, until - time.monotonic()))
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGTERM)
+    try:
+        process.wait(timeout=10.0)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    return None
 
 
 def main() -> int:
@@ -119,10 +152,13 @@ def main() -> int:
             environment = os.environ | {"DATA": str(data), "MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1"}
             environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{environment['PATH']}"
             prepare(folder, data, environment)
-            for command in commands(page):
-                ended, last = run(command, folder, environment, arguments.seconds)
-                bad += "FAILED" in ended
-                print(f"{page.name}\t{ended}\t{command}\t{last[:160]}", flush=True)
+            for command in BEFORE.get(page.name, ()):
+                subprocess.run(command, shell=True, cwd=folder, env=environment, check=True, capture_output=True)
+            shown = list(commands(page))
+            for group in [shown] if page.name in TOGETHER else [[command] for command in shown]:
+                for command, (how, last) in zip(group, run(group, folder, environment, arguments.seconds), strict=True):
+                    bad += "FAILED" in how
+                    print(f"{page.name}\t{how}\t{command}\t{last[:160]}", flush=True)
     return int(bad > 0)
 
 
