@@ -81,6 +81,8 @@ def prepare(folder: Path, data: Path, environment: dict[str, str]) -> None:
     (folder / "recordings").symlink_to(data / "panda_kinesthetic")
     for name in ("pouring", "letter_h", "bottle2shelf", "letter_e"):
         shutil.copy(data / "panda_kinesthetic" / f"{name}.npy", folder)
+        if name == "pouring":
+            continue  # the pages learn it
         learn = f"imitarm learn {name}.npy --units cm --duration 10 --task {name} --out {name}.json"
         subprocess.run(shlex.split(learn), cwd=folder, env=environment, check=True, capture_output=True)
     sweep = "imitarm learn src/imitarm/tasks/data/sweep --task sweep --out sweep.json"
