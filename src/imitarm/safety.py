@@ -31,12 +31,12 @@ _ROUNDING = 1e-9  # [m/s, rad/s]
 
 
 class Cause(NamedTuple):
-    """Why a safety filter changed a command: the two parts that the command would have brought too near.
+    """Why a safety filter changed a command: it would have brought these two parts too near to each other.
 
     Attributes:
         link: name of the part of the arm, as in the robot's file.
         other: name of the obstacle, or of another link.
-        room: distance of the two minus the required clearance [m].
+        room: distance between the two parts minus the required clearance [m].
     """
 
     link: str
@@ -53,12 +53,12 @@ class SafetyStep:
 
     Attributes:
         velocity: joint velocity to send, shape (n_joints,) [rad/s].
-        changed: norm of the difference between ``velocity`` and the velocity that the command would yield with only
-            the joint limits [rad/s]; 0 when no clearance inequality was active.
+        changed: norm of the difference between ``velocity`` and the velocity without clearances, which keeps only the
+            joint limits [rad/s]; 0 if no clearance inequality was active.
         slack: largest violation of a clearance inequality [m/s]; 0 when all inequalities are kept.
         safe: whether ``velocity`` keeps every limit and every clearance inequality; if False, no joint velocity keeps
             them all.
-        cause: the pair for which the filter had to change the command most; None when it changed nothing.
+        cause: the pair that required the largest change of the command; None if the filter changed nothing.
     """
 
     velocity: Array
@@ -76,8 +76,9 @@ class SafetyStep:
 class SafetyFilter:
     r"""Converts commands to joint velocities that keep the arm's limits and its clearances.
 
-    Each step finds the joint velocity that is closest to the command and meets two conditions, by one quadratic program
-    (:class:`~imitarm.kinematics.ik.IKSolver`):
+    In each step, one quadratic program (:class:`~imitarm.kinematics.ik.IKSolver`) finds the joint velocity nearest to
+    the command.
+    This velocity meets two conditions:
 
     * The velocity always stays inside the position, velocity and acceleration limits of the joints.
     * No part of the arm approaches an obstacle faster than allowed by
@@ -85,16 +86,18 @@ class SafetyFilter:
       :class:`~imitarm.scene.clearance.SelfClearance`. An arm at rest yields to an obstacle that moves towards it.
 
     If these inequalities :math:`A \dot q \ge b` contradict the joint limits, no safe motion exists, and ``safe`` is
-    False. The command is then dropped, and the velocity is the one with the least squared violation of the
-    inequalities [m/s] among all velocities that approach nothing faster than full braking would:
+    False. The filter then ignores the command.
+    No distance may then shrink faster than during full braking:
 
     .. math:: A\, \dot q \;\ge\; \min(b,\; A\, \dot q_b), \qquad \dot q_b = \dot q_p \max(0, 1 - dt / t_b)
 
-    Here, :math:`\dot q_p` is the previous velocity, and :math:`t_b = \max_j |\dot q_{p,j}| / a_j` the time in which all
-    joints together can brake to rest. If a hit can't be avoided, the arm therefore recedes as fast as it can, or at
-    least brakes as hard as it can.
+    Among the velocities that keep this limit, the filter takes the velocity with the least sum of squared violations of
+    the inequalities. Here, :math:`\dot q_p` is the previous velocity, :math:`a_j` is the acceleration limit of joint j,
+    and :math:`t_b = \max_j
+    |\dot q_{p,j}| / a_j` is the time in which all joints together can brake to rest. If a collision can't be avoided,
+    the arm therefore moves away as fast as it can, or at least brakes as hard as it can.
 
-    The same filter serves every policy and teleoperation.
+    All policies and teleoperation use this filter.
 
     Args:
         arm: the arm with its tool.
@@ -103,13 +106,13 @@ class SafetyFilter:
         allowance: margin added to the clearance, because no robot moves exactly as commanded [m].
         self_clearance: required distance between links that are not neighbours [m]; None: not checked.
         limits: limits of the inverse kinematics; None: position, velocity and acceleration of each joint.
-        method: method of the inverse kinematics; only ``"qp"`` keeps clearances, so with another method both clearances
-            must be None.
+        method: method of the inverse kinematics. Only ``"qp"`` keeps clearances; with another method, ``clearance`` and
+            ``self_clearance`` must be None.
         latency: time between a command and the motion of the arm [s].
-        margin: distance by which each clearance is enlarged for the error of a predicted obstacle; it is evaluated at
+        margin: bound of the error of a predicted obstacle position, which is added to the clearance. It is evaluated at
             the obstacle's age (time since it was seen) plus ``latency``. None: predictions count as exact.
-        deviations: number of standard deviations of an obstacle's position by which the clearance is enlarged as well,
-            for obstacles with a covariance.
+        deviations: for obstacles with a covariance, this many standard deviations of the position are also added to the
+            clearance.
 
     Raises:
         InputError: when a number can't be used, or the method can't keep a required clearance.

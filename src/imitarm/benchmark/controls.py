@@ -1,10 +1,10 @@
 """Controls of the avoidance benchmark: methods whose results show that the benchmark measures what it should.
 
-* ``no-avoidance`` follows the learned path. If it succeeded, the scenes would be void.
+* ``no-avoidance`` follows the learned path. If it succeeded, the scenes would test nothing.
 * ``aims-at-obstacle`` steers through the middle of the nearest obstacle. If it ever succeeded, the measures would be
   wrong.
 * ``oracle`` is the independent search of :mod:`imitarm.benchmark.refusal_oracle`. It decides which scenes have a
-  solution. If a method solved a scene that the oracle proves impossible, one of the two would be wrong.
+  solution. If a method solved a scene that the oracle proves impossible, the method or the oracle would be wrong.
 """
 
 from __future__ import annotations
@@ -45,13 +45,15 @@ class NoAvoidance(PathPolicy):
 
 
 class AimsAtObstacle(PathPolicy):
-    r"""Steer through the middle of the nearest obstacle.
+    r"""Displace the learned path so that it passes through the middle of the nearest obstacle.
 
-    With c the middle of the obstacle and j the sample of the learned path that is nearest to c:
+    Let c be the middle of the obstacle [m], and j the sample of the learned path that is nearest to c.
+    The displaced path passes through c at sample j:
 
     .. math:: x_i = \bar x_i + w_i (c - \bar x_j), \qquad w_j = 1
 
-    The weight w is a smooth bump. No displacement has a component in a forbidden direction.
+    Here, x_i is sample i of the displaced path and x̄_i is sample i of the learned path [m]. The weight w_i is 1 at
+    sample j and falls smoothly to 0 on both sides of it. No displacement has a component in a forbidden direction.
     """
 
     title: ClassVar[str] = "aims at the obstacle"
@@ -74,7 +76,7 @@ class AimsAtObstacle(PathPolicy):
 
 
 class Oracle(PathPolicy):
-    """Return the path of the oracle that checks refusals, or refuse with its answer.
+    """Reproduce the path that the oracle finds, or refuse the scene if the oracle finds none.
 
     Args:
         skill: skill to reproduce.
@@ -82,7 +84,7 @@ class Oracle(PathPolicy):
         options: arguments of :class:`~imitarm.policies.path_policy.PathPolicy`.
 
     Attributes:
-        answer: the last answer.
+        answer: what the oracle found in the last scene: a path, a proof that no path exists, or neither.
     """
 
     title: ClassVar[str] = "oracle"
@@ -93,10 +95,11 @@ class Oracle(PathPolicy):
         self.answer: Answer | None = None
 
     def plan_motion(self, scene: Scene, start: Pose | None = None, state: ArmState | None = None) -> PathPlan:
-        """Return the path of the oracle.
+        """Search for a path with the oracle, and return it.
 
         Raises:
-            InfeasibleError: when the oracle finds no path; the message says whether it proved that none exists.
+            InfeasibleError: when the oracle finds no path; the message says whether the oracle proved that no path
+                exists.
         """
         path = ComponentPath.of_skill(self.skill, n_samples=_SAMPLES, pinned=self._pinned)
         path = path.between(self.skill, start, scene.goal)
@@ -107,8 +110,11 @@ class Oracle(PathPolicy):
         )
         self.answer, positions = decide(question)
         if positions is None:
+            proved = self.answer is Answer.IMPOSSIBLE
             raise InfeasibleError(
-                "it is proved that no path exists" if self.answer is Answer.IMPOSSIBLE else "no path and no proof found"
+                "the oracle proved that no path exists"
+                if proved
+                else "the oracle found neither a path nor a proof that no path exists"
             )
         return PathPlan.beside(path.nominal, path.nominal.with_positions(positions))
 

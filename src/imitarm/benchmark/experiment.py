@@ -29,7 +29,7 @@ from imitarm.tasks.stack_run import DT, run_stack
 REPLAYS = (*KINDS, CAPTURED)
 """Tasks in which a method follows a recording."""
 LIVE = "live stacking"
-"""The task in which a simulated person stacks cubes with a method in the loop."""
+"""The closed-loop task: a simulated person leads the robot through a retargeting method, and stacks cubes with it."""
 ROBOTS = ("sawyer", "panda")
 FORMAT = "imitarm-result"
 VERSION = 1
@@ -76,9 +76,9 @@ VARIANTS: Mapping[str, Method] = {
     "m1-scaled": Method("m1", "M1, scaled", {"velocity_scaling": True}),
     "m3-scaled": Method("m3", "M3, scaled", {"velocity_scaling": True}),
 }
-"""Methods with changed options, to show the effects of the options. "Me-thesis" fits one NURBS to the whole recording
-and uses the small-angle term. "as printed" keeps the misprints of the thesis, except those that stop the method from
-running. "scaled" slows all joints down together where one joint would be too fast."""
+"""Methods with changed options, to show the effects of the options. "Me-thesis" fits one NURBS curve to the whole
+recording and uses the small-angle term of the thesis. "as printed" keeps the misprints of the thesis, except those that
+stop the method from running. "scaled" slows all joints down together where one joint would be too fast."""
 
 METHODS: Mapping[str, Method] = {**MAIN, **VARIANTS}
 """All methods by name."""
@@ -97,7 +97,7 @@ def method(name: str) -> Method:
 
 @dataclass(frozen=True)
 class Experiment:
-    """The definition of one run of one method in one task; plain values that can be sent to another process or machine.
+    """What defines one run of one method in one task. All values are plain, so another process or machine can run it.
 
     ``Experiment("edge", "modern", seed=3).run()`` makes the recording, lets the method follow it, and measures the
     result.
@@ -138,7 +138,7 @@ class Experiment:
 
     @property
     def plan(self) -> Plan:
-        """Definition of the recording to follow; for the live task, a stacking recording with the same seeds."""
+        """Definition of the recording to follow; the live task uses the seeds of a stacking recording."""
         kind = "stacking" if self.task == LIVE else self.task
         return Plan(kind, self.seed, self.repeat, self.seconds, self.sigma, self.data)
 
@@ -201,7 +201,7 @@ class Experiment:
 class StackingOutcome:
     """The outcome of one closed-loop trial of stacking.
 
-    Torques are those of the drives, and include the effect of contacts.
+    Torques are measured at the drives, so they include the effect of contacts.
 
     Attributes:
         success: whether four cubes stand in order.
@@ -213,8 +213,8 @@ class StackingOutcome:
         mean_torque: mean of the absolute torque of each joint [N m].
         rms_torque: root mean square of each joint's torque [N m].
         effort: integral over time of the squared torques, summed over the joints [N^2 m^2 s].
-        peak_torque_ratio: largest torque relative to the rated torque.
-        velocity_ratio: largest measured joint velocity relative to its limit.
+        peak_torque_ratio: largest torque divided by the rated torque of that joint.
+        velocity_ratio: largest measured joint velocity divided by the limit of that joint.
         clamped: number of control steps in which the robot's limits changed the command.
     """
 
@@ -275,7 +275,7 @@ def count_failures(outcomes: Sequence[str]) -> str:
     """Return a text with the number of failures of each kind, most frequent first.
 
     Args:
-        outcomes: for each trial, the kind of failure; an empty text means success.
+        outcomes: one text for each trial: the kind of failure, or an empty text after a success.
     """
     counted = Counter(outcome for outcome in outcomes if outcome)
     return ", ".join(f"{what}: {n}" for what, n in counted.most_common()) or "none"
@@ -290,7 +290,7 @@ class Result:
         code: version of the code that ran, see :func:`imitarm.benchmark.provenance.code_version`.
         values: measures by name. For a recording, the measures are those of
             :class:`~imitarm.evaluation.mapping_metrics.MappingMetrics`, ``recorded`` [s], ``beyond_reach`` (fraction of
-            the time) and the ``notes`` of the method. For a closed-loop trial, the measures are those of
+            the time) and the ``notes`` of the method. For a closed-loop trial, the measures are the attributes of
             :class:`StackingOutcome`. Empty after a failure.
         failure: reason why there are no measures; empty if there are measures.
         seconds: computing time [s].
@@ -359,7 +359,7 @@ class Result:
 
 
 def plain(value: Any) -> Any:
-    """Return ``value`` for JSON: numbers that are not finite become None."""
+    """Return a copy of ``value`` that JSON can hold: numbers that are not finite become None."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -180,7 +180,7 @@ def wall_with_gap(
         rng: source of the random numbers.
         path: nominal path, shape (n, 3) [m].
         width: width of the gap [m].
-        shift: the centre of the gap is at most so far from the path [m].
+        shift: largest distance between the centre of the gap and the path [m].
         height: height of the wall [m].
     """
     middle = path[len(path) // 2]
@@ -210,7 +210,7 @@ def covered_end(seed: int, path: Array, *, planar: bool) -> Case:
 
 
 def covering_sphere(rng: np.random.Generator, point: Array, *, planar: bool) -> Sphere:
-    """Make a sphere that covers ``point`` (3,) [m], or leaves the tool there less than the required clearance."""
+    """Make a sphere so near to ``point`` (3,) [m] that a tool there touches it or has too little clearance."""
     radius = rng.uniform(0.02, 0.05)
     direction = rng.normal(size=3) * ([1.0, 1.0, 0.0] if planar else [1.0, 1.0, 1.0])
     direction /= np.linalg.norm(direction)

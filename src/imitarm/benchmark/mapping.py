@@ -34,14 +34,14 @@ CAMERAS = 8  # simulated cameras before the captured arm, which is that of one p
 
 @dataclass(frozen=True)
 class MappingBenchmark:
-    """What is run.
+    """Which experiments the mapping benchmark runs.
 
     Attributes:
         people: number of simulated persons.
-        first: number of the first person; the persons are ``first`` to ``first + people - 1``. Numbers below 200 are
-            for developing methods, and numbers from 200 on are for testing. Therefore no method is tested with a person
+        first: number of the first person; the persons are ``first`` to ``first + people - 1``. Persons below 200 are
+            for developing methods, and persons from 200 on are for testing. Therefore no method is tested with a person
             with whom it was tuned.
-        repeats: number of closed-loop trials of each person. For replay, there is one recording of each kind and
+        repeats: number of closed-loop trials of each person. The replay tasks use one recording of each kind and
             person.
         methods: names in :data:`imitarm.benchmark.experiment.METHODS`.
         kinds: kinds of recordings, from :data:`imitarm.benchmark.recordings.KINDS`.
@@ -105,7 +105,7 @@ class ResultFolder(Store[Experiment, Result]):
 
     Args:
         folder: the folder; created if missing.
-        reuse: whether a result of another version of the code is valid.
+        reuse: whether to use saved results of another version of the code.
 
     Raises:
         InputError: when the folder can't be written to.
@@ -121,7 +121,7 @@ class ResultFolder(Store[Experiment, Result]):
             ) from error
 
     def known(self, experiments: Sequence[Experiment]) -> dict[Experiment, Result]:
-        """Return the saved results; results that are unreadable or (without ``reuse``) of other code are left out."""
+        """Return the saved results; unreadable results and, without ``reuse``, results of other code are left out."""
         return {e: found for e in experiments if (found := self._kept(e)) is not None}
 
     def save(self, experiment: Experiment, outcome: Result) -> Result:
@@ -146,7 +146,7 @@ def run_all(
     reuse: bool = False,
     on_done: OnDone | None = None,
 ) -> list[Result]:
-    """Run experiments in parallel and return their results in the same order.
+    """Run experiments in parallel, and return the results in the order of the experiments.
 
     Each result is a separate file in ``folder/runs``, written as soon as the experiment is finished. If a result of the
     same configuration and the same code was saved earlier, this result is read, and the experiment is not run again.
@@ -196,7 +196,7 @@ _TORQUES = {
 
 
 def tables(results: Results) -> list[Table]:
-    """Return all tables for which there are results; the table on the claims of the thesis comes first."""
+    """Return every table that has results; the table on the claims of the thesis comes first."""
     replayed, found = results.tasks(), []
     if replayed:
         stacking = results.tasks(["stacking"]) or replayed

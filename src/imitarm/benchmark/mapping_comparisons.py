@@ -59,7 +59,7 @@ def _compared(results: Results, tasks: Sequence[str]) -> Iterator[tuple[Figure, 
 
 
 def comparison_table(results: Results, tasks: Sequence[str]) -> Table:
-    """Return a table that compares ``modern`` with each other method, in pairs on the same recordings or trials."""
+    """Return a table that compares ``modern`` with every other method on the same recordings or trials."""
     rows = [
         (_titled(figure), METHODS[name].title, *_difference(comparison, figure), f"{p:.3f}")
         for figure, name, comparison, p in _compared(results, tasks)
@@ -67,9 +67,9 @@ def comparison_table(results: Results, tasks: Sequence[str]) -> Table:
     columns = ("measure", f"{OURS} minus", "difference (95 %)>", "relative [%]>", "pairs>", "p, Holm>")
     note = (
         "↑ marks measures for which a larger value is better. For all other measures, a smaller value is better. "
-        "Intervals are computed by resampling the persons. p is computed by sign flips of the persons' differences, "
-        "and corrected for the number of methods that are compared in each measure. "
-        "Pairs: recordings for which both methods have a value."
+        "Intervals are computed by resampling the persons. The p-value is computed by sign flips of the persons' "
+        "differences. and corrected for the number of methods that are compared in each measure. Pairs: recordings "
+        "for which both methods have a value."
     )
     return Table(f"Paired comparison: {', '.join(tasks)}", columns, tuple(rows), note)
 
@@ -94,9 +94,9 @@ def better_methods_table(results: Results, tasks: Sequence[str]) -> Table:
         "p, Holm>",
     )
     note = (
-        f"The table lists every measure whose interval shows that {OURS} is worse, whatever the value of p. It also "
-        f"lists every method that had a higher success rate in stacking than {OURS}, whatever the interval. "
-        "↑ marks measures for which a larger value is better. For all other measures, a smaller value is better."
+        f"The table lists every measure whose interval shows that {OURS} is worse, even if p is large. The table also "
+        f"lists every method that had a higher success rate in stacking than {OURS}, even if the interval includes "
+        "zero. ↑ marks measures for which a larger value is better. For all other measures, a smaller value is better."
     )
     return Table(f"Where another method is better than {OURS}", columns, tuple(rows), note)
 
@@ -139,7 +139,7 @@ PRINTED_TIME = np.array([22.23, 18.43, 17.72, 19.2, 15.82, 14.21, 13.03, 9.01, 9
 """Execution time of Table 3.1 [s]."""
 
 ME = ("thesis", "modern")
-"""The two methods that are compared in place of the thesis's method Me: Me with corrected equations, and ``modern``."""
+"""The two methods that stand for the thesis's method Me: ``thesis`` is Me with corrected equations."""
 BASELINES = ("m1", "m2", "m3")
 _TORQUE_FIGURE = Figure("mean_torque", "mean torque [N m]", digits=2)
 _PATH_FIGURE = Figure("path_length", "path [m]", digits=2)
@@ -169,8 +169,9 @@ def printed_table(results: Results, tasks: Sequence[str]) -> Table:
     over = int(np.sum(PRINTED_TORQUES.mean(axis=0) > arm.max_torque))
     note = (
         "Values are means (95 % interval). In the rows of the methods, torques and path are from the replayed "
-        f"recordings ({', '.join(tasks)}), and the time is from the closed-loop trials that succeeded. {over} of the 7 "
-        "printed means are above the rated torques of the joints, so they can't be mean torques of a Sawyer's joints."
+        f"recordings ({', '.join(tasks)}), and the time is from the closed-loop trials that succeeded. In the thesis, "
+        f"{over} of the 7 printed means are above the rated torques of the joints, so they can't be mean torques of a "
+        "Sawyer's joints."
     )
     return Table("Table 3.1 of the thesis, and our values", columns, tuple(rows), note)
 
@@ -199,7 +200,7 @@ def claims_table(results: Results, tasks: Sequence[str]) -> Table:
         'The result is "yes" if, for every baseline, the 95 % interval of the difference is on the claimed side of '
         'zero and the corrected p is below 0.05. The result is "no" if, for at least one baseline, the interval is on '
         'the opposite side of zero. All other results are "not shown". Times are compared only for trials in which '
-        "both methods succeeded."
+        "the method and the baseline both succeeded."
     )
     return Table("Claims of the thesis, and results", columns, tuple(rows), note)
 

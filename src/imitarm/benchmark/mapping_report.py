@@ -27,7 +27,7 @@ from imitarm.viewer.retarget_report import PLAYER_KEYS, MethodResult, RetargetRe
 _SHOWN: Final = 9.0  # [s] of the recording that is played
 _WORDS: Final = {
     "Interval": "The 95 % confidence interval of a mean over persons, from resampling the persons. Overlapping "
-    "intervals do not rule out a difference; the paired comparison tests for it.",
+    "intervals do not rule out a difference; the table of paired comparisons tests for a difference.",
     "Lag": "The constant delay that gives the best match between the path of the tool and the true path of the hand.",
     "From first engagement": "The distance between the tool and its true target, from the time at which the robot "
     "begins to follow until the end. This includes the time in which the robot does not follow the person.",

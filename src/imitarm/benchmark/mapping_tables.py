@@ -68,14 +68,14 @@ TORQUES = (
     Figure("rms_torque", "RMS torque [N m]", digits=2),
     Figure("mean_motion_torque", "mean torque without gravity [N m]", digits=2),
 )
-"""The torque measures, averaged over the joints; each of them also has a table with one column for each joint."""
+"""The torque measures, averaged over the joints. Each measure also has a table with one column for each joint."""
 LOOP = (Figure("time", "time [s]", digits=0), Figure("path_length", "path [m]", digits=2), TORQUES[0])
 
 _RECORDED = (Figure("recorded", "length [s]"), Figure("beyond_reach", "beyond reach [%]", 100.0))
 _MEANS_NOTE = "Each value is the mean over persons (95 % interval)."
 _ACCURACY_NOTE = (
-    "Distances are root mean squares. Executed: measured on an arm that keeps its limits, as a real arm does. Engaged: "
-    "fraction of the time in which the robot followed the person."
+    "Distances are root mean squares. Executed: distance measured on a simulated arm that keeps its limits, as a real "
+    "arm does. Engaged: fraction of the time in which the robot followed the person."
 )
 _CAPTURED_NOTE = (
     "All recordings show the motion of one person, so there is no interval: each value is the mean over the cameras "
@@ -105,9 +105,9 @@ class Results:
         Args:
             method: name of the method.
             tasks: tasks whose results are included.
-            name: name of the measure. ``"limit_violations"`` is the sum of the violations of position, velocity and
-                acceleration limits. In closed loop, ``"success"`` is 1 or 0, and the other measures are known only for
-                successful trials.
+            name: name of the measure. ``"limit_violations"`` is the sum of three numbers: the frames that exceed a
+                limit of position, of velocity, and of acceleration. In closed loop, ``"success"`` is 1 or 0, and the
+                other measures are known only for successful trials.
             joint: index of the joint, for measures with one value for each joint; None for the mean over the joints.
         """
         return {
@@ -181,8 +181,8 @@ def recordings_table(results: Results) -> Table:
         rows.append((task, of, who, *cells))
     columns = ("kind", "recordings>", "persons", *(f"{figure.title}>" for figure in _RECORDED))
     note = (
-        "Beyond reach: fraction of the time in which the target of the wrist is farther away than the robot's arm is "
-        f"long. A recording that could not be made is missing for every method. {persons_note(results)}"
+        "Beyond reach: fraction of the time in which the wrist's target is farther from the robot's shoulder than the "
+        f"robot's arm is long. A recording that could not be made is missing for every method. {persons_note(results)}"
     )
     return Table("Recordings, the same for every method", columns, tuple(rows), note)
 
@@ -265,7 +265,7 @@ def limits_table(results: Results, tasks: Sequence[str]) -> Table:
 
 
 def success_table(results: Results) -> Table:
-    """Return a table on stacking in closed loop: success rate, and time and path of the successful trials."""
+    """Return a table on stacking in closed loop: success rate, and time and path length of the successful trials."""
     rows = []
     for name in results.methods:
         runs = results.of(name, [LIVE])

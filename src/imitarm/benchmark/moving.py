@@ -30,27 +30,27 @@ Options = tuple[tuple[str, float | str], ...]
 OURS = ("rcamo", "rcamo-certified")
 """Our methods."""
 WORLDS = ("tool", *ROBOTS)
-"""Worlds: the tool alone, and two arms."""
+"""The worlds in which a method can be tested: the tool alone, and two simulated arms."""
 _PLAN_JOINTS = ("rrt-connect", "rrt-connect-tilt", "rcamo-certified")  # these need an arm
 _PLAN_ONCE = ("elastic-band", "tp-gmm")  # the first plans once; the second differs from gmm-dmp at other ends only
 
 
 def method_names(world: str = "tool") -> tuple[str, ...]:
-    """Return the names of all methods in a world: the controls, and the policies that can move there."""
+    """Return the names of all methods in a world: the controls, and the policies that can run in this world."""
     if world == "tool":
         return (*CONTROLS, *(name for name in POLICIES if name not in _PLAN_JOINTS))
     return (CONTROLS[0], *POLICIES)
 
 
 def default_methods(world: str = "tool") -> tuple[str, ...]:
-    """Return the methods that are compared by default; the oracle with tracks takes too long."""
+    """Return the methods that are compared by default; the slow control ``oracle-tracks`` is left out."""
     if world != "tool":
         return (CONTROLS[0], *OURS, "acfra", "dmp-potential", "barrier", "modulation")
     return tuple(name for name in method_names() if name not in (*_PLAN_ONCE, "oracle-tracks"))
 
 
 def build(method: str, case: MovingCase, options: Options = (), world: str = "tool") -> Policy:
-    """Return the policy of a method for a scene; in a world with an arm, the policy may also plan the joints.
+    """Return the policy of a method for a scene; in a world with an arm, the policy may also plan the joint motion.
 
     Raises:
         UnknownNameError: when there is no such method.
@@ -74,7 +74,7 @@ def build(method: str, case: MovingCase, options: Options = (), world: str = "to
 
 @dataclass(frozen=True)
 class MovingExperiment:
-    """One method in one scene with one sensor; plain values that can be sent to another process or machine.
+    """One method in one scene with one sensor. All values are plain, so another process or machine can run it.
 
     Attributes:
         family: one of :data:`~imitarm.benchmark.moving_scenes.FAMILIES`.
@@ -82,8 +82,8 @@ class MovingExperiment:
         seed: number of the scene, and of the sensor's errors.
         method: one of :func:`method_names`.
         options: options that replace the defaults of the method.
-        world: one of :data:`WORLDS`: the tool alone, or the whole arm, which only moves in 3-D.
-        noise: standard deviation of the sensor (:class:`~imitarm.control_loop.SensorModel`) [m].
+        world: one of :data:`WORLDS`. A world with an arm needs ``dimension`` 3.
+        noise: standard deviation of a measured position (:class:`~imitarm.control_loop.SensorModel`) [m].
         rate: rate of the sensor [Hz].
         latency: delay of the sensor [s].
         dropout: probability that an obstacle is missed in a frame.
@@ -129,7 +129,7 @@ class MovingExperiment:
 
     @property
     def scene(self) -> tuple[str, int, int]:
-        """What experiments of different methods in the same scene have in common."""
+        """The key of the scene; experiments of different methods in the same scene have the same key."""
         return self.family, self.dimension, self.seed
 
     def case(self) -> MovingCase:
@@ -139,7 +139,7 @@ class MovingExperiment:
         return moving_case(self.family, self.dimension, self.seed)
 
     def moved(self) -> tuple[MovingCase, ToolRun]:
-        """Return the scene and the motion of the tool alone, for measuring and drawing."""
+        """Return the scene, and the motion of the tool without an arm, for measuring and drawing."""
         case = self.case()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of numerical methods in hard scenes: the motion is measured anyway
@@ -150,7 +150,7 @@ class MovingExperiment:
         """Let the method move the tool in its scene, and measure the motion.
 
         Returns:
-            The result. An error of the method is the outcome "failed"; the reason says which one.
+            The result. If the method raises an error, the outcome is "failed", and the reason contains the error.
         """
         values: dict[str, Any] = {}
         try:

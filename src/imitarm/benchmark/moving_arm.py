@@ -1,4 +1,4 @@
-"""The world of the moving benchmark with a whole arm: a simulated robot, its safety filter, and the same sensor."""
+"""The world of the moving benchmark with a whole arm: a simulated robot, its safety filter, and a sensor."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from imitarm.trajectory import Rollout
 Array = NDArray[np.float64]
 
 ROBOTS = {"sawyer": "brush", "panda": "gripper"}
-"""Arms, and their tools."""
+"""Name of each arm, and the name of the tool that it holds."""
 _SPARE = 0.01  # [m] beyond the required clearance, at the start and at the goal
 _STILL = 0.05  # [rad/s] joints slower than this stand
 
@@ -49,9 +49,10 @@ def prepared(robot: str) -> tuple[Skill, ArmModel, Array]:
 
 
 def arm_case(robot: str, family: str, seed: int) -> MovingCase:
-    """Return a scene around the sweep of an arm that leaves the arm free at the start, and its tool at the goal.
+    """Return a scene around the path of the skill 'sweep'.
 
-    A seed whose scene does not is replaced by a seed that is 10 000 larger.
+    No obstacle overlaps the arm at the start, or its tool at the goal. If the scene of a seed breaks this rule, the
+    seed is replaced by a seed that is 10 000 larger.
 
     Raises:
         InputError: when no scene is found.
@@ -107,10 +108,10 @@ class _Timed(Policy):
 
 
 def run_arm(policy: Policy, case: MovingCase, robot: str, sensor: SensorModel) -> tuple[str, str, dict[str, Any]]:
-    """Let a policy move an arm in a scene; return outcome, explanation and measures as for the tool alone.
+    """Let a policy move an arm in a scene; return the outcome, its explanation, and the measures.
 
-    Clearance and contacts are those of the simulator, for the whole arm. The safety filter requires the clearance of
-    all links.
+    The measures are those of a tool without an arm, but the simulator measures clearance and contacts of the whole arm.
+    The safety filter requires the clearance of all links.
     """
     _, arm, start = prepared(robot)
     body = SimulatedRobot(arm, scene=case.truth.scene, motion=case.truth.motions, q=start)
@@ -166,7 +167,7 @@ def _measured(
 
 
 def _contact(pairs: list[str], steps: list[Step]) -> Contact:
-    """Return the first contact; the closing speed counts as that of the obstacle if the joints stand."""
+    """Return the first contact; if the joints are at rest, the closing speed is attributed to the obstacle."""
     gaps = np.array([step.clearance for step in steps])
     k = int(np.argmax(gaps <= 0.0)) if (gaps <= 0.0).any() else int(np.argmin(gaps))
     closing = float(gaps[max(k - 1, 0)] - gaps[k]) / DT if k else 0.0

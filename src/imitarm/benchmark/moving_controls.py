@@ -1,10 +1,11 @@
 """Controls of the moving benchmark: methods whose results show that the benchmark measures what it should.
 
-* ``no-avoidance`` follows the learned motion. If it succeeded, the scenes would be void.
+* ``no-avoidance`` follows the learned motion. If it succeeded, the scenes would test nothing.
 * ``aims-at-obstacle`` steers to the middle of the nearest tracked obstacle. If it ever succeeded, the measures would be
   wrong.
-* ``oracle-future`` knows the true motion of the obstacles. What it does not solve may have no solution.
-* ``oracle-tracks`` searches with the tracked obstacles, as the methods do, every 0.1 s.
+* ``oracle-future`` knows the true motion of the obstacles. A scene that this oracle does not solve may have no
+  solution.
+* ``oracle-tracks`` knows only the tracked obstacles, as the methods do. It searches again every 0.1 s.
 
 The oracles search space and time (:func:`search`) and share no code with the compared methods.
 """
@@ -32,11 +33,11 @@ from imitarm.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Gap = Callable[[Array, float], Array]
-"""Type of a function that returns the gap (n,) [m] between the tool at points (n, 3) and the nearest obstacle at a time
-[s]."""
+"""Type of a function of points (n, 3) [m] and a time [s]. The function returns, for a tool at each of the points, the
+gap to the nearest obstacle at that time, shape (n,) [m]."""
 
 LAYER = 0.05
-"""Time between two layers [s]."""
+"""Time between two layers of the search [s]; a layer is the grid of cells at one instant."""
 _CELL = {2: 0.02, 3: 0.03}  # [m]
 _BESIDE = {2: 0.30, 3: 0.24}  # [m] the grid reaches so far beyond the learned path
 _REACH = 2  # cells that the tool may move between two layers
@@ -53,7 +54,7 @@ _AHEAD = 0.97  # of the longest duration, for the arrival
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """The cells around a learned path, in which the oracles search.
+    """The grid of cells around a learned path in which the oracles search.
 
     Attributes:
         points: centres of the cells, shape (n, 3) [m].
@@ -85,7 +86,7 @@ class Grid:
         return int(i[0]), int(i[1]), int(i[2])
 
     def moves(self) -> list[tuple[int, int, int]]:
-        """Return the moves between two layers, in cells; the first one is to stay."""
+        """Return the allowed moves from one layer to the next, in cells; the first move is to stay in the same cell."""
         x, y, z = (range(-min(_REACH, n - 1), min(_REACH, n - 1) + 1) for n in self.shape)
         found = [m for m in itertools.product(x, y, z) if sum(i * i for i in m) <= _REACH**2]
         return sorted(found, key=lambda m: sum(i * i for i in m))
@@ -94,17 +95,17 @@ class Grid:
 def search(
     grid: Grid, start: Array, nominal: Trajectory, gap: Gap, *, begin: float, end: float, margin: float
 ) -> Trajectory | None:
-    """Return the motion of least cost, from ``start`` at ``begin`` to the goal; None if there is none.
+    """Return the motion of least cost from ``start`` to the goal, or None if there is no such motion.
 
-    In each layer of time, the tool may stay or move to a near cell. A cell is free in a layer if the tool there keeps a
-    margin from every obstacle at this time. Dynamic programming finds the chain of free cells with the least sum of
-    squared distances from the learned motion.
+    From one layer to the next, the tool may stay or move to a near cell. A cell is free in a layer if the tool in this
+    cell keeps ``margin`` from every obstacle at this instant. Dynamic programming finds the chain of free cells with
+    the least sum of squared distances from the learned motion.
 
     Args:
         grid: the cells.
         start: position at the time ``begin``, shape (3,) [m].
         nominal: the learned motion from time 0.
-        gap: distances to the obstacles over time.
+        gap: function that returns the gap between the tool and the nearest obstacle, see :data:`Gap`.
         begin: time of the first layer [s].
         end: latest time of arrival [s].
         margin: smallest gap of a free cell [m].
@@ -165,7 +166,7 @@ def _smoothed(times: Array, path: Array, goal: Array) -> Trajectory:
 
 
 class AimsAtNearest(Policy):
-    """Steer to the middle of the nearest tracked obstacle; without one, follow the learned motion."""
+    """Steer to the middle of the nearest tracked obstacle; if no obstacle is tracked, follow the learned motion."""
 
     title: ClassVar[str] = "aims at the obstacle"
 
@@ -197,7 +198,7 @@ class Oracle(Policy):
 
     Args:
         case: the scene, with the true future.
-        tracked: whether the search uses the observed obstacles instead, again every 0.1 s.
+        tracked: True: search with the observed obstacles, every 0.1 s. False: search once, with the true future.
         options: arguments of :class:`~imitarm.policies.Policy`.
     """
 
@@ -225,7 +226,7 @@ class Oracle(Policy):
         self._motion = found
 
     def step(self, observation: Observation, dt: float) -> Command:
-        """Return the velocity that follows the motion found last."""
+        """Return the velocity that follows the last motion that the search found."""
         del dt
         time, x = observation.time, observation.tool_to_base.position
         if self.tracked and time - self._searched >= _PERIOD - 1e-9 and time < self._end - 2.0 * _PERIOD:

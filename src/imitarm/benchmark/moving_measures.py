@@ -20,13 +20,14 @@ from imitarm.trajectory import Trajectory
 Array = NDArray[np.float64]
 
 PER_PERIOD = 2
-"""Times in each control period at which the true distance is computed."""
+"""Number of instants in each control period at which the true distance is computed."""
 OUTCOMES = ("success", "too near", "contact", "missed goal", "late", "refused", "failed")
 """Possible outcomes: "success"; "too near" (a success, but nearer to an obstacle than required); "contact"; "missed
 goal" (the policy ended the motion elsewhere); "late" (not arrived after twice the learned duration); "refused" (before
 any motion); "failed" (the method raised an error)."""
 SUCCESSES = OUTCOMES[:2]
-"""Outcomes that count as success: no contact, and goal reached in time. The world keeps the limits of the tool."""
+"""Outcomes that count as a success: the tool touched nothing, and reached the goal in time. The simulation itself keeps
+the tool within its limits of speed and acceleration."""
 _STALLED = 0.02  # [m/s] a tool slower than this stands
 _TRACKED = 0.15  # [m] a track farther than this from an obstacle belongs to something else
 _LOOKS = 0.10  # [s] before a contact, at which its cause is determined
@@ -40,9 +41,9 @@ class Contact:
 
     Attributes:
         obstacle: name of the obstacle.
-        time: when it begins [s].
+        time: time at which the contact begins [s].
         obstacle_speed: speed of the obstacle's surface towards the tool [m/s].
-        tool_speed: speed of the tool towards the obstacle [m/s]; negative while it yields.
+        tool_speed: speed of the tool towards the obstacle [m/s]; negative when the tool moves away from the obstacle.
         braking: whether the tool stands, or brakes with at least half of its largest deceleration.
         status: status of the policy's command.
         cause: explanation, see :func:`contacts`.
@@ -65,19 +66,22 @@ def measured(case: MovingCase, run: ToolRun) -> tuple[str, str, dict[str, Any]]:
 
         * ``clearance``: smallest true distance of the tool from an obstacle [m];
         * ``goal_error``: distance from the goal at the end [m];
-        * ``duration``, ``duration_ratio``: time to the end [s], and relative to the learned duration;
-        * ``rmse``, ``rmse_unaffected``: root mean square distance from the learned path at equal times (after its end,
-          from the goal) [m], over all samples, and over those at which the tool on the learned path is farther than
-          10 cm from every obstacle;
-        * ``path_rmse``: the same from the nearest point of the learned path, which does not depend on the timing [m];
+        * ``duration``, ``duration_ratio``: duration of the motion [s], and this duration divided by the learned
+          duration;
+        * ``rmse``: root mean square distance between the motion and the learned motion at equal times [m]; after the
+          end of the learned motion, the distance to the goal counts;
+        * ``rmse_unaffected``: like ``rmse``, but only over the samples at which the tool on the learned path is farther
+          than 10 cm from every obstacle [m];
+        * ``path_rmse``: root mean square distance to the nearest point of the learned path, whatever the timing [m];
         * ``stall``: longest time for which the tool stands before it arrives [s];
-        * ``length_ratio``: path length divided by that of the learned path; ``sparc``, ``ldlj``: smoothness;
-        * ``max_speed``, ``max_acceleration``: of the tool [m/s], [m/s^2];
+        * ``length_ratio``: path length divided by the length of the learned path;
+        * ``sparc``, ``ldlj``: smoothness, as spectral arc length and as logarithmic dimensionless jerk;
+        * ``max_speed``, ``max_acceleration``: largest speed and acceleration of the tool [m/s], [m/s^2];
         * ``step_median``, ``step_p99``, ``reset_seconds``: computing time of the policy [s];
         * ``position_error``, ``velocity_error``: root mean square errors of the tracks at the current time [m], [m/s];
-          ``nees``: mean normalised squared error of their positions, 3 if the covariance is right;
-          ``switches``: number of times an obstacle's track number changes; ``unseen``: fraction of the time without a
-          track;
+        * ``nees``: mean normalised squared error of the tracked positions, 3 if the covariance is right;
+        * ``switches``: number of times the track number of an obstacle changes;
+        * ``unseen``: fraction of the time in which an obstacle has no track;
         * ``contacts``: list of :class:`Contact` as dictionaries.
     """
     values: dict[str, Any] = {"step_median": math.nan, "step_p99": math.nan, "reset_seconds": run.reset_seconds}
@@ -119,7 +123,7 @@ def _dense(run: ToolRun) -> tuple[Array, Array]:
 
 
 def motion_measures(case: MovingCase, run: ToolRun, times: Array, gap: Array) -> dict[str, float]:
-    """Return the measures of the motion, see :func:`measured`; ``gap`` (n_obstacles, n) belongs to ``times`` (n,)."""
+    """Return the measures of the motion, see :func:`measured`; ``gap`` (n_obstacles, n) [m] is the gap at ``times``."""
     skill = case.skill
     goal, T = skill.goal_.position, skill.duration_
     nominal = skill.nominal(np.linspace(0.0, T, 400))
@@ -167,9 +171,13 @@ def _longest_stall(run: ToolRun, speed: Array, goal: Array) -> float:
 def contacts(case: MovingCase, run: ToolRun, times: Array, points: Array, gap: Array) -> list[Contact]:
     """Return the first contact with each obstacle, each with its cause.
 
-    The cause is the first of these that holds: the obstacle had no track 0.1 s before the contact ("not tracked"); its
-    track was wrong by more than 3 cm ("wrong track"); the tool stands, or moves away from the obstacle ("the obstacle
-    moves into the tool"); the tool brakes ("braked too late"); else "the tool moves into the obstacle".
+    The first cause in this list whose condition is true is chosen:
+
+    * "not tracked": the obstacle had no track 0.1 s before the contact;
+    * "wrong track": 0.1 s before the contact, the track was more than 3 cm away from the obstacle;
+    * "the obstacle moves into the tool": the tool stands, or moves away from the obstacle;
+    * "braked too late": the tool brakes;
+    * "the tool moves into the obstacle": none of the other conditions is true.
     """
     found = []
     scene = case.truth.scene
@@ -213,7 +221,8 @@ def _cause(case: MovingCase, seen: list[Seen], i: int, time: float, towards: flo
 def tracking(case: MovingCase, seen: list[Seen]) -> dict[str, float]:
     """Return the errors of the observed obstacles, see :func:`measured`.
 
-    An obstacle's track is the nearest one within 15 cm. Obstacles out of the sensor's reach are left out.
+    The track of an obstacle is the track nearest to it, if that track is within 15 cm. Obstacles out of the sensor's
+    reach are left out.
     """
     squares, speeds, nees, missing, switches, total = [], [], [], 0, 0, 0
     last: dict[int, int] = {}

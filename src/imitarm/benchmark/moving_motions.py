@@ -14,9 +14,9 @@ from imitarm.scene.motion import Motion, Track
 Array = NDArray[np.float64]
 
 AWAY = np.array([0.0, 0.0, -50.0])
-"""Where an obstacle is before it appears [m]: out of the reach of every sensor."""
+"""Position of an obstacle before it appears, shape (3,) [m]; it is out of the reach of every sensor."""
 BEFORE = 2.0
-"""How long before time 0 a motion begins [s]."""
+"""Every motion of an obstacle begins this long before time 0 [s]."""
 _MOVES, _RESTS = (0.4, 0.9), (0.3, 0.8)  # [s] of an obstacle that stops and goes on
 _RAMP = 10  # samples over which its speed changes
 _STEP = 0.01  # [s]
@@ -25,13 +25,13 @@ _RATE = 0.5, 1.5  # [rad/s] of turning
 
 
 def straight(obstacle: Obstacle) -> Motion:
-    """Return the motion of an obstacle with its constant velocity, without rotation."""
+    """Return the motion of an obstacle that keeps its velocity and does not rotate."""
     start, velocity = obstacle.solid().position, obstacle.velocity
     return lambda time: start + time * velocity
 
 
 def appearing(motion: Motion, time: float) -> Motion:
-    """Return a motion that is far away before ``time`` [s]."""
+    """Return ``motion``, except that the obstacle is far away before ``time`` [s]."""
     return lambda now: AWAY if now < time else motion(now)
 
 
@@ -40,10 +40,10 @@ def stop_and_go(rng: np.random.Generator, obstacle: Obstacle, time: float, veloc
 
     Args:
         rng: source of the random durations.
-        obstacle: at the meeting point.
-        time: when it is at the meeting point [s].
-        velocity: while it moves, shape (3,) [m/s].
-        until: when the motion ends [s].
+        obstacle: the obstacle, with the pose that it has at the meeting point.
+        time: time at which the obstacle is at the meeting point [s].
+        velocity: velocity of the obstacle while it moves, shape (3,) [m/s].
+        until: time at which the motion ends [s].
     """
     times = np.arange(-BEFORE, until, _STEP)
     goes = np.zeros(len(times))
@@ -65,11 +65,11 @@ def weaving(
 
     Args:
         rng: source of amplitude, period and phase.
-        obstacle: at the meeting point.
-        time: when it is at the meeting point [s].
-        velocity: mean velocity, shape (3,) [m/s].
+        obstacle: the obstacle, with the pose that it has at the meeting point.
+        time: time at which the obstacle is at the meeting point [s].
+        velocity: mean velocity of the obstacle, shape (3,) [m/s].
         side: direction of the swing, unit vector (3,) perpendicular to the velocity.
-        fastest: largest speed [m/s]; limits the amplitude.
+        fastest: largest speed of the obstacle [m/s]; if necessary, the amplitude is reduced to keep this speed.
     """
     at, rate, phase = obstacle.solid().position, 2.0 * math.pi / rng.uniform(*_PERIOD), rng.uniform(0.0, 2.0 * math.pi)
     widest = math.sqrt(fastest**2 - float(velocity @ velocity)) / rate
@@ -85,7 +85,7 @@ def weaving(
 def turning(
     rng: np.random.Generator, obstacle: Obstacle, time: float, velocity: Array, side: Array, fastest: float
 ) -> Motion:
-    """Return a motion on a circle, whose velocity at the meeting point is ``velocity``.
+    """Return a motion on a circle; at the meeting point, the obstacle moves with ``velocity``.
 
     The arguments are those of :func:`weaving`; ``side`` points to the centre of the circle.
     """

@@ -1,6 +1,6 @@
 """The results of the moving benchmark as one self-contained HTML page: charts, tables, and playback.
 
-The experiments are deterministic, so a motion to be drawn is computed again; results hold no paths.
+Results hold no paths. The experiments are deterministic, so the report repeats each experiment whose motion it draws.
 """
 
 from __future__ import annotations
@@ -37,9 +37,10 @@ _RATE: Final = 25.0  # [1/s] frames
 _RESPONSE: Final = 0.25  # [m] gap below which Fig 5.10 links tool and obstacle
 _WORDS: Final = {
     "Success": "The tool touches no true obstacle, and reaches the goal within twice the learned duration.",
-    "Oracle": "An independent search in space and time: one knows the true future, one the tracked obstacles only.",
+    "Oracle": "An independent search in space and time. One oracle knows the true future of the obstacles, "
+    "the other knows only the tracked obstacles.",
     "RMSE": "Root mean square distance from the learned motion at equal times.",
-    "NEES": "Normalised estimation error squared of a tracked position; 3 if the covariance is right.",
+    "NEES": "Normalised estimation error squared of a tracked position; its mean is 3 if the covariance is right.",
 }
 
 
@@ -56,7 +57,8 @@ def write_moving_report(
         results: results of the benchmark.
         path: the file to write; its folder must exist.
         provenance: facts needed to repeat the benchmark.
-        scenes: scenes to draw, as family, dimension and seed; if empty, contacts of our methods and others are chosen.
+        scenes: scenes to draw, as family, dimension and seed; if empty, failures of our methods are chosen first, then
+            one success in each family.
 
     Raises:
         InputError: when the file can't be written, a scene has no result, or the drawing libraries are not installed.
@@ -126,7 +128,7 @@ def success_chart(results: MovingResults, family: str) -> str:
 
 
 def responses_chart(case: MovingCase, run: ToolRun, name: str) -> str:
-    """Draw thesis Fig 5.10: the paths of the tool and of the obstacles from above, and links where they are near."""
+    """Draw thesis Fig 5.10: paths of tool and obstacles from above; lines link the two where their gap is small."""
     learned = case.skill.nominal(np.linspace(0.0, case.skill.duration_, 200)).positions
     places = np.array([case.truth.poses(float(t))[0] for t in run.times])
     near = distances_in_time(case.truth, run.times, run.positions) - case.tool_spheres[0, 3] < _RESPONSE
@@ -216,7 +218,7 @@ def _tabs(chosen: Sequence[MovingResult]) -> tuple[tuple[str, str] | None, list[
         e = result.experiment
         title = f"{MovingResults.row_of(result)}: {e.family}, {e.dimension}-D, seed {e.seed}"
         facts = {"Outcome": result.outcome, "Reason": result.reason or "–"}
-        caption = "Seen from above; black lines link tool and obstacle where they are nearer than 25 cm (Fig 5.10)."
+        caption = "Seen from above. Black lines link tool and obstacle where their gap is below 25 cm (Fig 5.10)."
         content = {
             "facts": facts,
             "figure": Figure(svg, "Paths of tool and obstacles", caption),

@@ -19,7 +19,7 @@ RESULTS = ResultFormat("imitarm-moving-result 1", MovingExperiment, MovingResult
 
 
 class MovingResults:
-    """Results of many experiments, by row (method, with its options) and by scene."""
+    """Results of many experiments, by scene and by table row; a row is a method with its options."""
 
     def __init__(self, results: Sequence[MovingResult]) -> None:
         self.all = list(results)
@@ -35,19 +35,19 @@ class MovingResults:
 
     @staticmethod
     def row_of(result: MovingResult) -> str:
-        """Return the name of the row of a result: method, and options that are not the defaults."""
+        """Return the name of the table row of a result: the method, and the options that differ from its defaults."""
         options = ", ".join(f"{name} {value}" for name, value in result.experiment.options)
         return f"{result.experiment.method}{', ' if options else ''}{options}"
 
     @staticmethod
     def sensor_of(result: MovingResult) -> tuple[float, float, float, float, float]:
-        """Return noise [m], rate [Hz], latency [s], dropout and occlusions [1/s]."""
+        """Return the sensor of a result: noise [m], rate [Hz], latency [s], dropout probability, occlusions [1/s]."""
         e = result.experiment
         return e.noise, e.rate, e.latency, e.dropout, e.occlusions
 
     @cached_property
     def rows(self) -> list[str]:
-        """The rows: first the controls, then the methods in the order of their success."""
+        """The names of the table rows: first the methods, the most successful first, then the controls."""
         by_row: dict[str, list[bool]] = defaultdict(list)
         for result in self.all:
             by_row[self.row_of(result)].append(result.success)
@@ -56,7 +56,7 @@ class MovingResults:
         return [*others, *controls]
 
     def families(self) -> list[str]:
-        """Return the families that were run, in their order."""
+        """Return the families that have results, in the order of ``FAMILIES``."""
         there = {result.experiment.family for result in self.all}
         return [family for family in FAMILIES if family in there]
 

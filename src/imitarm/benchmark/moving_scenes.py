@@ -2,20 +2,21 @@
 
 | family | obstacles |
 |---|---|
-| M1 | crosses the path at 50 to 130 degrees |
-| M2 | comes towards the tool |
-| M3 | moves with the tool and overtakes it, or is overtaken |
-| M4 | stops and goes on across the path |
-| M5 | weaves or turns, so that its velocity is never constant |
-| M6 | 3 to 6 obstacles, whose tracks cross one another |
-| M7 | appears suddenly, 10 to 30 cm from the tool |
-| M8 | one moves, one or two stand on the path |
-| M9 | rotates about its centre, and drifts |
+| M1 | an obstacle that crosses the path at an angle of 50 to 130 degrees |
+| M2 | an obstacle that comes towards the tool |
+| M3 | an obstacle that moves in the direction of the tool, and overtakes the tool or is overtaken |
+| M4 | an obstacle that crosses the path, and stops several times on its way |
+| M5 | an obstacle that weaves or moves on a circle, so that its velocity is never constant |
+| M6 | 3 to 6 obstacles, whose paths cross one another |
+| M7 | an obstacle that appears suddenly, 10 to 30 cm from the tool |
+| M8 | one moving obstacle, and one or two obstacles at rest on the path |
+| M9 | an obstacle that rotates about its centre while it moves |
 | M10 | a person's arm, as two capsules, from recordings of real persons |
 
-An obstacle meets the tool where the tool would be on the learned path at a random time; its speed is 0.1 to 0.6 m/s. A
-scene in which the tool of the learned motion would touch nothing is void and is drawn again, as are scenes in which an
-obstacle is at the start at the beginning, or passes over the goal between the learned duration and 1.6 times of it.
+For each obstacle, a random time is drawn. At this time, the obstacle is where the tool would be on the learned path.
+The speed of an obstacle is 0.1 to 0.6 m/s. A scene is drawn again in three cases: the tool of the learned motion would
+touch nothing; an obstacle covers the start at the beginning; or an obstacle covers the goal between 1 and 1.6 times the
+learned duration.
 """
 
 from __future__ import annotations
@@ -43,9 +44,9 @@ from imitarm.trajectory import Trajectory
 Array = NDArray[np.float64]
 
 SLOWEST, FASTEST = 0.1, 0.6
-"""Speeds of obstacles [m/s]; a person's arm moves as it was recorded."""
+"""Smallest and largest speed of an obstacle [m/s]; a person's arm moves as it was recorded."""
 LONGEST = 1.6
-"""Times the learned duration until which the goal stays free."""
+"""No obstacle covers the goal until this multiple of the learned duration."""
 _MET = 0.25, 0.7  # fractions of the duration between which an obstacle meets the tool
 _OFF = 0.012  # [m] standard deviation of the meeting point about the path
 _FREE = TOOL_RADIUS + CLEARANCE + 0.005  # [m] from the tool's tip, at the start and at the goal
@@ -66,10 +67,10 @@ class MovingCase:
         dimension: 2 when the path may only be displaced horizontally, else 3.
         seed: number of the scene.
         skill: the skill whose motion is blocked.
-        truth: the true obstacles over time, from before time 0.
+        truth: the true obstacles over time; their motion begins before time 0.
         touched: time at which the tool of the learned motion first touches an obstacle [s].
         tool_spheres: spheres that cover the tool, rows x y z radius in the tool's frame, shape (m, 4) [m].
-        clearance: required [m].
+        clearance: required clearance [m].
         forbidden: directions in which the path must not be displaced.
     """
 
@@ -164,7 +165,9 @@ def moving_case(family: str, dimension: int, seed: int, *, skill: Skill | None =
         if touched is not None:
             forbidden = HORIZONTAL_ONLY if dimension == 2 else ()
             return MovingCase(family, dimension, seed, own, truth, touched, forbidden=forbidden)
-    raise InputError(f"no scene of {family} blocks the path and leaves its ends free; choose another skill")
+    raise InputError(
+        f"no scene of {family} blocks the path and leaves its start and its goal free; choose another skill"
+    )
 
 
 def distances_in_time(truth: MovingScene | Scene, times: Array, points: Array) -> Array:

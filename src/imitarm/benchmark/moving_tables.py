@@ -20,7 +20,7 @@ from imitarm.benchmark.tables import Table
 from imitarm.evaluation.intervals import bootstrap, holm
 
 FEW, MANY = ("M1", "M2", "M3", "M4", "M5", "M7", "M9"), ("M6", "M8", "M10")
-"""Families with one obstacle, and with several."""
+"""``FEW``: families with one moving obstacle. ``MANY``: families with several."""
 READINGS = {
     "RCAMO": ("rcamo", "rcamo-certified"),
     "DMP+AT": ("dmp-potential", "dmp-steering"),
@@ -28,13 +28,13 @@ READINGS = {
     "GMM+DMP": ("gmm-dmp",),
     "GMM+IRL": ("gmm-irl",),
 }
-"""Our methods for each method of thesis Figs 5.7 and 5.11."""
+"""For each method in Figs 5.7 and 5.11 of the thesis, the methods of this library that stand for it."""
 _LISTED = 12  # contacts in a table
 _FORESEEN = "oracle-future"
 
 
 def moving_tables(results: MovingResults) -> list[Table]:
-    """Return all tables: those of the tool alone, then the rates of success with arms."""
+    """Return all tables: first the tables of the tool without an arm, then the tables of each arm."""
     arms = [world for world in results.worlds if world != "tool"]
     found = _tool_tables(results.in_world("tool")) if "tool" in results.worlds else []
     for world in arms:
@@ -46,8 +46,8 @@ def moving_tables(results: MovingResults) -> list[Table]:
 
 
 _ARM_NOTE = (
-    "Clearance and contacts are those of the whole arm. 'no-avoidance' is the learned motion with the filter alone. "
-    "Intervals: Wilson."
+    "Clearance and contacts are those of the whole arm. In 'no-avoidance', only the safety filter changes the learned "
+    "motion.  Intervals: Wilson."
 )
 
 
@@ -91,9 +91,10 @@ def success_table(results: MovingResults) -> Table:
     )
     broken = sum(not limits_kept(dict(r.values)) for r in results.all)
     note = (
-        "Success: no contact with the true obstacles, goal reached within 5 mm and twice the learned duration. The "
-        f"tool is limited to {MAX_SPEED:g} m/s and {MAX_ACCELERATION:g} m/s^2; {broken} runs exceed these limits. "
-        "Intervals: Wilson. Times per step: medians over the runs."
+        "Success: the tool touches no true obstacle, and comes within 5 mm of the goal in at most twice the learned "
+        f"duration. The tool is limited to {MAX_SPEED:g} m/s and {MAX_ACCELERATION:g} m/s^2; {broken} runs exceed "
+        "these limits. Intervals: Wilson. Time per step: each run has a median and a 99th percentile; the table shows "
+        "their medians over the runs."
     )
     return Table("Success among moving obstacles", columns, tuple(rows), note)
 
@@ -113,7 +114,7 @@ def family_table(results: MovingResults) -> Table:
     solved = _solved(results)
     if solved:
         parts = ", ".join(f"{good} of {of} in {family}" for family, (good, of) in solved.items())
-        note += f" The search that knows the true future solves {parts}."
+        note += f" Number of scenes that the oracle with the true future solves: {parts}."
     columns = ("method", *(f"{family}>" for family in families))
     return Table("Success % (95 %) in each family", columns, tuple(rows), note)
 
@@ -161,9 +162,10 @@ def quality_table(results: MovingResults) -> Table:
         "LDLJ>",
     )
     note = (
-        "Over the successes of each method, which differ between methods; compare in pairs. RMSE: distance from the "
-        f"learned motion at equal times. Unaffected: samples at which the tool of the learned motion is farther than "
-        f"{100 * NEAR:.0f} cm from every obstacle. Of the path: from the nearest point of the learned path."
+        "Each row includes only the scenes in which its method succeeds. These scenes differ between methods, so the "
+        "paired table compares methods better. RMSE: distance from the learned motion at equal times. Unaffected: "
+        f"RMSE over the samples at which the tool of the learned motion is farther than {100 * NEAR:.0f} cm from every "
+        "obstacle. Of the path: RMSE from the nearest point of the learned path."
     )
     return Table("Quality of the successful motions", columns, tuple(rows), note)
 
@@ -187,7 +189,7 @@ def rmse_table(results: MovingResults, families: Sequence[str], title: str) -> T
 
 
 def _paired(results: MovingResults, row: str, other: str, families: Sequence[str]) -> tuple[int, int, int, list[float]]:
-    """Return scenes, those in which only one succeeds, and the differences of the RMSE where both succeed [m]."""
+    """Return the number of scenes, those that only each row solves, and differences of RMSE where both succeed [m]."""
     pairs = [
         (found[row], found[other])
         for scene, found in results.by_scene.items()
@@ -224,7 +226,10 @@ def paired_table(results: MovingResults) -> Table:
         f"RMSE of {ours} minus the other [mm]>",
         "p>",
     )
-    note = "p: McNemar's exact test and Wilcoxon's signed-rank test, corrected by Holm's method."
+    note = (
+        "p: McNemar's exact test of the successes, and Wilcoxon's signed-rank test of the RMSE; Holm's method corrects "
+        "both."
+    )
     return Table(f"{ours} and each other method in the same scenes", columns, tuple(rows), note)
 
 
@@ -233,7 +238,7 @@ def _p(value: float) -> str:
 
 
 def claims_table(results: MovingResults) -> Table:
-    """Return the statements of thesis Chapter 5 with what was found, and the checks of the benchmark."""
+    """Return a table of the claims of thesis Chapter 5 and the benchmark's own checks, each with its result."""
     rows = [
         _claim(
             results, "DMP+AT has a smaller RMSE than RCAMO with one moving obstacle (Fig 5.7)", FEW, ("DMP+AT",), -1
@@ -308,7 +313,7 @@ def _success_claim(results: MovingResults, text: str, families: Sequence[str]) -
 
 
 def sensor_table(results: MovingResults) -> Table:
-    """Return the rates of success for each sensor, if several were used."""
+    """Return a table of the rates of success for each sensor; it is empty if all runs used the same sensor."""
     sensors = sorted({results.sensor_of(r) for r in results.all})
     if len(sensors) < 2:
         return Table("Success by sensor", (), ())
@@ -326,7 +331,7 @@ def sensor_table(results: MovingResults) -> Table:
 
 
 def tracking_table(results: MovingResults) -> Table:
-    """Return the errors of the tracked obstacles in each family, which are the same for all methods."""
+    """Return a table of the errors of the tracked obstacles in each family; they do not depend on the method."""
     rows = []
     for family in results.families():
         found = next((of for row in results.rows if (of := results.of(row, family))), [])
@@ -348,7 +353,10 @@ def tracking_table(results: MovingResults) -> Table:
         "changes of the track number per run>",
         "time without a track [%]>",
     )
-    note = "At the current time, that is after the prediction over the latency; means over the runs of one method."
+    note = (
+        "Errors at the current time, for which the tracker predicts each obstacle over the latency. Means over "
+        "the runs of one method."
+    )
     return Table("Tracked obstacles", columns, tuple(rows), note)
 
 

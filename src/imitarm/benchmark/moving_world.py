@@ -27,10 +27,14 @@ _STILL = 0.005  # [m/s] a tool slower than this is at rest
 
 
 class Seen(NamedTuple):
-    """What the policy observed in one control step: the tracked obstacles, and when.
+    """What the policy observed in one control step: the time [s] and the tracked obstacles.
 
-    ``positions`` and ``velocities`` have shape (n, 3) [m], [m/s], ``covariances`` (n, 3, 3) [m^2] with nan where
-    unknown, ``track_ids`` (n,).
+    Attributes:
+        time: time of the observation [s].
+        positions: position of each tracked obstacle, shape (n, 3) [m].
+        velocities: velocity of each tracked obstacle, shape (n, 3) [m/s].
+        covariances: covariance of each position, shape (n, 3, 3) [m^2]; nan where it is unknown.
+        track_ids: number of each track, shape (n,).
     """
 
     time: float
@@ -41,7 +45,7 @@ class Seen(NamedTuple):
 
     @classmethod
     def of(cls, scene: Scene, time: float) -> Seen:
-        """Return what a scene contains."""
+        """Return the tracked obstacles of a scene that was observed at ``time`` [s]."""
         packed = scene.packed
         return cls(time, packed.positions, packed.velocities, packed.covariances, np.asarray(packed.track_ids))
 
@@ -51,15 +55,15 @@ class ToolRun:
     """The motion of the tool in one run.
 
     Attributes:
-        times: start of each control period, and the end, shape (n + 1,) [s].
+        times: start of each control period, and end of the last one, shape (n + 1,) [s].
         positions: positions of the tool at these times, shape (n + 1, 3) [m].
         statuses: status of the policy's command in each period, n values.
         seen: observed obstacles at every third step.
         step_seconds: time of each call of the policy's ``step`` [s].
         reset_seconds: time of the policy's ``reset`` [s].
-        arrived: whether the policy says that it has arrived.
+        arrived: whether the policy reported that the motion has arrived.
         refusal: why the policy refused before any motion; empty if it did not.
-        last: the last command.
+        last: the last command of the policy.
     """
 
     times: Array = field(default_factory=lambda: np.zeros(1))
@@ -74,7 +78,7 @@ class ToolRun:
 
 
 def run_tool(policy: Policy, case: MovingCase, observe: Callable[[float], Scene]) -> ToolRun:
-    r"""Let a policy move the tool in a scene, until it has arrived and is at rest, or twice the learned duration.
+    r"""Let a policy move the tool in a scene, until the tool rests at the goal, for at most twice the learned duration.
 
     The tool follows the commanded velocity as well as its limits allow. With the control period ``h``:
 
@@ -82,8 +86,8 @@ def run_tool(policy: Policy, case: MovingCase, observe: Callable[[float], Scene]
         v_{k+1} = v_k + \mathrm{clip}(u_k - v_k,\ a_{max} h), \qquad x_{k+1} = x_k + h v_{k+1},
         \qquad |v| \le v_{max}
 
-    The limits are those of the static benchmark. A tool that has arrived, or whose policy refuses, is stopped; it does
-    not rotate.
+    The limits of speed and acceleration are those of the static benchmark. If the tool has arrived, or if the policy
+    refuses, the tool stops. The tool never rotates.
 
     Args:
         policy: the policy.
@@ -120,7 +124,7 @@ def run_tool(policy: Policy, case: MovingCase, observe: Callable[[float], Scene]
 
 
 def within_limits(velocity: Array, wanted: Array, dt: float = DT) -> Array:
-    """Return the velocity after one period, the nearest to ``wanted`` that the limits allow, shape (3,) [m/s]."""
+    """Return the velocity after one period that is nearest to ``wanted`` within the limits, shape (3,) [m/s]."""
     size = float(np.linalg.norm(wanted))
     target = wanted * min(1.0, MAX_SPEED / size) if size > 0.0 else wanted
     change = target - velocity

@@ -27,22 +27,23 @@ _CHI_SQUARE_95 = 7.815  # quantile of the chi-square distribution with 3 degrees
 
 @dataclass(frozen=True)
 class Seen:
-    """How one true obstacle was detected.
+    """How well one true obstacle was detected.
 
     Attributes:
         family: family of the scene.
         shape: true shape.
         distance: distance of the camera from the middle of the table [m].
-        first: whether it is the obstacle that the family is about.
-        pixels: number of pixels that show it.
-        uncovered: fraction of its volume outside of all detections; 1 if it was missed.
-        sticks_out: largest distance of a point of its surface from the detections [m].
-        excess: largest distance of a surface point of its detection from the nearest true obstacle [m]; like the
-            following values nan if it has no detection of its own, because it was missed or is one with another.
-        error: distance of the detection's position from the true one [m].
-        size_error: mean absolute difference of the lengths along three directions [m].
-        normalised: squared position error divided by its covariance.
-        right_shape: whether the shape was recognised.
+        first: whether this is the main obstacle of the scene, after which its family is named.
+        pixels: number of pixels of the image that show the obstacle.
+        uncovered: fraction of the obstacle's volume that lies outside every detection.
+        sticks_out: largest distance from a point of the obstacle's surface to the nearest detection [m].
+        excess: largest distance from a surface point of the detection to the nearest true obstacle [m]. This value and
+            the following values are nan if the obstacle was missed, or was detected together with another obstacle as
+            one.
+        error: distance of the detection's position from the true position [m].
+        size_error: mean absolute difference between the lengths of obstacle and detection along three directions [m].
+        normalised: squared Mahalanobis distance of the position error, with the covariance of the detection.
+        right_shape: whether the detection has the obstacle's kind of shape.
     """
 
     family: str
@@ -60,12 +61,12 @@ class Seen:
 
     @property
     def merged(self) -> bool:
-        """Whether it was found together with another obstacle, as one."""
+        """Whether the obstacle was detected together with another obstacle, as one."""
         return not self.missed and bool(np.isnan(self.error))
 
     @property
     def missed(self) -> bool:
-        """Whether no detection contains a fifth of the obstacle."""
+        """Whether less than a fifth of the obstacle's volume lies inside the detections."""
         return self.uncovered > 1.0 - _COVERED
 
 
@@ -75,7 +76,7 @@ class Frame:
 
     Attributes:
         family: family of the scene.
-        seen: the obstacles of which at least 12 pixels are visible.
+        seen: the obstacles of which at least 12 pixels are visible in the image.
         false: number of detections farther than 5 cm from every obstacle.
         detections: number of detections.
         seconds: processor time of the detection [s].
@@ -123,8 +124,8 @@ def run_frames(
         count: number of scenes.
         first: first seed.
         families: families of scenes.
-        noise: noise of the camera; None: that of a Kinect.
-        height: rows of the image.
+        noise: noise of the camera; None: the noise of a Kinect.
+        height: number of rows of the image.
         on_done: called with the number of evaluated scenes and the number of all scenes.
     """
     count = whole_number(count, "count", at_least=1)
@@ -250,17 +251,18 @@ def tables(frames: Sequence[Frame]) -> list[Table]:
             ),
             tuple(_cost(family, own) for family, own in false if own),
             "A detection is false if it is farther than 5 cm from every obstacle. Time: processor time of one thread "
-            "for each image; images/s is the inverse of its mean.",
+            "for each image; images/s is the inverse of the mean time.",
         ),
     ]
 
 
 _NOTE = (
-    f"Counted are obstacles of which the camera sees at least {LEAST_VISIBLE} pixels. Missed: less than a fifth of its "
-    "volume is inside of the detections. Merged: found together with another obstacle, as one. Uncovered: mean part "
-    "of the volume outside of all detections. Sticks out: largest distance of a point of the true surface from the "
-    "detections. Too large: largest distance of a point of the detection's surface from the true obstacles. In 95 % "
-    "region: positions within the 95 % region of their covariance."
+    f"The tables count obstacles that cover at least {LEAST_VISIBLE} pixels of the image. Missed: less than a fifth of "
+    "the obstacle's volume lies inside the detections. Merged: the obstacle was detected together with another "
+    "obstacle, as one. Uncovered: mean fraction of the volume that lies outside every detection. Sticks out: largest "
+    "distance from a point of the true surface to the detections. Too large: largest distance from a point of the "
+    "detection's surface to the true obstacles. In 95 % region: fraction of the positions whose error lies in the 95 "
+    "% region of the estimated covariance."
 )
 
 

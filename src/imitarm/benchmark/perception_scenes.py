@@ -33,8 +33,8 @@ Array = NDArray[np.float64]
 
 SHAPES = ("sphere", "box", "cylinder", "capsule", "cone", "ellipsoid", "convex hull")
 FAMILIES = ("one object", "held bottle", "in contact", "half hidden", "empty")
-"""One object of any shape, standing or floating; a bottle that a forearm with a hand holds; two objects that touch each
-other; an object half hidden behind another; and no object at all."""
+"""Families of scenes: one object of any shape, standing or floating; a bottle that a forearm with a hand holds; two
+objects that touch each other; an object half hidden behind another object; and no object at all."""
 DISTANCES = (1.0, 2.0, 3.0)
 """Distances of the camera from the middle of the table [m]."""
 MOST = 10_000  # seeds of one family
@@ -54,8 +54,8 @@ class PerceptionScene:
     Attributes:
         family: one of :data:`FAMILIES`.
         seed: seed of the scene.
-        obstacles: the true obstacles; the first is the one that the family is about.
-        camera_to_base: pose of the camera.
+        obstacles: the true obstacles; the first is the main obstacle, after which the family is named.
+        camera_to_base: pose of the camera in the frame of the arm's base.
         distance: distance of the camera from the middle of the table [m].
         fixtures: floor, pedestal and table.
     """
@@ -69,7 +69,7 @@ class PerceptionScene:
 
     @property
     def shape(self) -> str:
-        """Shape of the first obstacle; empty without obstacles."""
+        """Shape of the first obstacle as text; empty if the scene has no obstacle."""
         return self.obstacles[0].kind.replace("_", " ") if self.obstacles else ""
 
 
@@ -109,7 +109,7 @@ def images(scene: PerceptionScene, noise: DepthNoise, height: int) -> tuple[Dept
     Args:
         scene: the scene.
         noise: noise of the camera.
-        height: rows of the image; the columns are 4/3 of it.
+        height: number of rows of the image; the image has 4/3 as many columns.
     """
     robot = SimulatedRobot(perception_arm(), scene=Scene(None, scene.obstacles, fixtures=scene.fixtures))
     intrinsics = Intrinsics.from_field_of_view(height * 4 // 3, height, _FIELD_OF_VIEW)

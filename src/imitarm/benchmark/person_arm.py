@@ -62,16 +62,16 @@ def has_recordings() -> bool:
 def person_arm(
     rng: np.random.Generator, time: float, meeting: Array, until: float
 ) -> tuple[tuple[Capsule, Capsule], tuple[Track, Track]]:
-    """Return upper arm and forearm of a person, at true size and speed, and their motions.
+    """Return the upper arm and the forearm of a person as capsules, and their motions, at true size and speed.
 
     A recording, an instant in it, a point of the forearm and a rotation about the vertical axis are drawn at random.
-    At this instant, the point is at the meeting point.
+    The recording is shifted and rotated so that, at this instant, the drawn point is at the meeting point.
 
     Args:
         rng: source of the random numbers.
-        time: when the forearm is at the meeting point [s].
-        meeting: the meeting point, shape (3,) [m].
-        until: when the motion may end [s].
+        time: time at which the drawn point of the forearm is at the meeting point [s].
+        meeting: the meeting point on the learned path, shape (3,) [m].
+        until: samples of the recording after this time are left out [s].
 
     Raises:
         InputError: when the recordings are missing.

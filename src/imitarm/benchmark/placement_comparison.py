@@ -14,24 +14,26 @@ from imitarm.benchmark.tables import Table
 from imitarm.errors import InputError
 
 _STYLE_NOTE = (
-    "A planning time is the processor time until the policy accepts or refuses; all placements count. The other "
-    "columns use only the motions that arrived. RMSE and deviation compare the path that the simulated arm executed "
-    "with the mean of the demonstrations as curves (200 points evenly spaced along the arc, matched by dynamic time "
-    "warping), because a planner's timing is its own. Deviation: largest Mahalanobis distance along the path, with the "
-    "covariance of GMR plus (5 mm)² in every direction. Tilt: largest rotation of the tool from the learned rotation "
-    "at the nearest point of the learned path. Tilt limit 'default': for acfra and rrt-connect-tilt two standard "
-    "deviations of the demonstrated rotation, for rrt-connect none."
+    "A planning time is the processor time until the policy accepts or refuses a placement; all placements count. The "
+    "other columns use only the motions that arrived. RMSE and deviation compare the path that the simulated arm "
+    "executed with the mean of the demonstrations as curves (200 points evenly spaced along the arc, matched by "
+    "dynamic time warping), because a planner chooses its own timing. Deviation: largest Mahalanobis distance along "
+    "the path, with the covariance of GMR plus (5 mm)² in every direction. Tilt: largest rotation of the tool from "
+    "the learned rotation at the nearest point of the learned path. Tilt limit 'default': acfra and rrt-connect-tilt "
+    "allow two standard deviations of the demonstrated rotation; rrt-connect allows any tilt."
 )
 _PAIR_NOTE = (
-    "Each row counts the placements that the baseline solves: it arrives, and keeps its clearance. Accepted and "
-    "solved: by {policy}, in these placements (Wilson's 95 % interval). Planning time: ratio of the medians over these "
-    "placements, refusals included. RMSE and deviation: ratio of the medians over the placements that both solve."
+    "Each row includes only the placements that the baseline solves: its arm arrives, and keeps the clearance. "
+    "Accepted and solved: how many of these placements {policy} accepts and solves (Wilson's 95 % interval). All "
+    "ratios divide the value of {policy} by the value of the baseline. Planning time: ratio of the medians over these "
+    "placements, refusals included. RMSE and deviation: ratio of the medians over the placements that both policies "
+    "solve."
 )
 _RMSE_TARGET, _DEVIATION_TARGET = 0.7, 0.5
 
 
 class Variant(NamedTuple):
-    """A policy with a limit of the tilt [rad]; None: the default of the policy."""
+    """A policy and its limit of the tool's tilt [rad]; if the limit is None, the policy uses its default."""
 
     policy: str
     max_tilt: float | None
@@ -47,7 +49,7 @@ Place = tuple[Setup, int]
 
 
 def comparison_tables(results: Iterable[PlacementResult], policy: str = "acfra") -> list[Table]:
-    """Return a table of all variants of all policies, and a table that compares one policy with the others in pairs.
+    """Return a table of all policies and tilt limits, and a table that compares one policy with each other policy.
 
     Args:
         results: results of any policies in any placements.

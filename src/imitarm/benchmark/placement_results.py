@@ -52,7 +52,7 @@ class PlacementResult:
     """Result of one policy in one placement.
 
     Attributes:
-        policy: its name.
+        policy: name of the policy.
         setup: the skill and the arm.
         seed: seed of the placement.
         outcome: one of :data:`~imitarm.benchmark.placements.OUTCOMES`.
@@ -61,13 +61,14 @@ class PlacementResult:
         planning: time until the policy accepted or refused the scene [s].
         reason: explanation of the outcome.
         max_tilt: largest rotation of the tool that was allowed [rad]; None: the policy's default.
-        computing: processor time of the planning, which other programs disturb less than ``planning`` [s].
+        computing: processor time of the planning [s]; other programs disturb it less than they disturb ``planning``.
         rmse: distance of the executed path from the mean of the demonstrations, see
             :class:`~imitarm.evaluation.path_style.PathStyle` [m]; nan unless the motion arrived.
-        deviation: largest deviation from the mean, in standard deviations of the demonstrations; nan likewise.
-        tilt: largest rotation of the tool away from the learned rotation [rad]; nan likewise.
-        tool_rmse: distance of the path planned for the tool alone in the same scene and between the same ends, measured
-            like ``rmse`` [m]; nan if no such path was found, or unless the motion arrived.
+        deviation: largest deviation from the mean, in standard deviations of the demonstrations; nan unless the motion
+            arrived.
+        tilt: largest rotation of the tool away from the learned rotation [rad]; nan unless the motion arrived.
+        tool_rmse: for comparison, the ``rmse`` of a path that is planned for the tool alone, in the same scene and
+            between the same ends [m]. It is nan if no such path was found, or if the motion did not arrive.
         code: version of the code, see :func:`~imitarm.benchmark.provenance.code_version`.
     """
 
@@ -118,9 +119,9 @@ def append_result(path: Path, result: PlacementResult) -> None:
 
 
 def load_results(paths: Iterable[Path]) -> dict[Run, PlacementResult]:
-    """Read results; of several results of the same run, the last one counts.
+    """Read results from a file; if a run has several results, the last result counts.
 
-    A last line without an end is left out, because a program that was killed did not finish it.
+    A last line without a line break is left out, because a program was killed before it finished this line.
 
     Raises:
         InputError: when a file can't be read.
@@ -150,7 +151,7 @@ def _result(line: str, where: str) -> PlacementResult:
 
 
 def repaired(path: Path) -> None:
-    """Remove the last line of a file of results if it has no end; a missing file is left alone.
+    """Remove an incomplete last line from a file of results; do nothing if there is no file.
 
     Raises:
         InputError: when the file can't be read or written.

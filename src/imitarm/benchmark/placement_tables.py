@@ -1,4 +1,4 @@
-"""Tables of placements: outcomes and times, the motions that arrived late, and the price of planning the whole arm."""
+"""Tables of placements: outcomes and times, the motions that arrived late, and the cost of planning the whole arm."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _RATIO_TARGET = 1.1
 
 
 def placement_tables(results: Sequence[PlacementResult]) -> list[Table]:
-    """Return the outcomes of each policy, the motions that arrived late, and the RMSE beside that of the tool alone.
+    """Return the tables of outcomes, of late arrivals, and of the RMSE in comparison with a plan for the tool alone.
 
     A table without rows is left out.
     """
@@ -63,7 +63,8 @@ def _outcomes(results: Sequence[PlacementResult]) -> Table:
             "time to refuse, median [ms]>",
         ),
         tuple(rows),
-        f"A simulated arm, {1e3 * CLEARANCE:.0f} mm required of every part of it. Intervals: Wilson, 95 %.",
+        f"A simulated arm, every part of which must keep {1e3 * CLEARANCE:.0f} mm of clearance. Intervals: Wilson, 95 "
+        "%.",
     )
 
 
@@ -74,12 +75,12 @@ def _late(results: Sequence[PlacementResult]) -> Table:
         f"Placements in which the arm arrived after more than {LATE:g} times the learned duration",
         ("policy", "skill", "robot", "seed>", "duration, times the learned duration>"),
         tuple((r.policy, Path(r.setup.skill).stem, r.setup.robot, str(r.seed), f"{r.duration:.2f}") for r in late),
-        "The duration includes the motion to another start posture, where the plan begins with one.",
+        "Some plans begin with a motion to another start posture; the duration includes this motion.",
     )
 
 
 def _beside_the_tool(results: Sequence[PlacementResult]) -> Table:
-    """Return the RMSE of each policy beside the RMSE of a plan for the tool alone, over all skills and for each."""
+    """Return a table of the RMSE of each policy and of a plan for the tool alone, for all skills and for each skill."""
     rows = []
     for policy in dict.fromkeys(result.policy for result in results):
         both = [r for r in results if r.policy == policy and r.arrived and math.isfinite(r.tool_rmse)]
@@ -110,7 +111,7 @@ def _beside_the_tool(results: Sequence[PlacementResult]) -> Table:
 
 
 def share(count: int, of: int) -> str:
-    """Return a count with its percentage and Wilson's 95 % interval as text; "-" of nothing."""
+    """Return a count with its percentage and Wilson's 95 % interval as text; "-" if ``of`` is 0."""
     if not of:
         return "-"
     low, high = wilson_interval(count, of)

@@ -46,9 +46,9 @@ from imitarm.trajectory import Rollout, Trajectory
 Array = NDArray[np.float64]
 
 OUTCOMES = ("arrived", "refused", "waited", "too near", "touched", "stopped")
-"""Possible outcomes of a placement: "arrived" (and kept the clearance), "refused" (before any motion), "waited" (not
-finished in time), "too near" (finished, but came closer to an obstacle than required), "touched" (contact, including
-self-collision), and "stopped" (protective stop or other failure)."""
+"""Possible outcomes of a placement: "arrived" (and kept the clearance), "refused" (before any motion), "waited" (the
+motion was not finished in time), "too near" (the motion was finished, but the arm came closer to an obstacle than
+permitted), "touched" (contact, including self-collision), and "stopped" (protective stop or other failure)."""
 
 CLEARANCE = 0.02  # [m] required
 _DT = 0.01  # [s]
@@ -60,7 +60,7 @@ _ALLOWANCE = 0.002  # [m] that ACFRA adds to the clearance when it plans for the
 
 
 def placement(skill: Skill, arm: ArmModel, seed: int, start: Array) -> Scene:
-    """Return a scene: one to three obstacles on the learned path, none of which touches the arm in its start posture.
+    """Return a scene with one to three obstacles on the learned path; none touches the arm in its start posture.
 
     Args:
         skill: the skill with the learned path.
@@ -154,10 +154,10 @@ def run_placement(policy: str, setup: Setup, seed: int, max_tilt: float | None =
 
 
 def tool_alone(setup: Setup, scene: Scene) -> float:
-    """Return the RMSE of the path that is planned for the tool alone, between the same ends as that of the whole arm.
+    """Plan a path for the tool alone, between the start and the goal of the whole arm's path, and return its RMSE.
 
     Args:
-        setup: the skill and the arm, whose tool keeps the clearance; its links are left out.
+        setup: the skill and the arm; only the arm's tool must keep the clearance, not its links.
         scene: the obstacles.
 
     Returns:
@@ -244,18 +244,18 @@ def run_placements(
 
     Args:
         policies: names in :data:`~imitarm.policies.POLICIES`.
-        setups: skills with their arms.
+        setups: skills, each with the arm that reproduces it.
         seeds: seeds of the placements.
         max_tilt: largest rotation of the tool away from the learned rotation [rad]; None: the policy's default.
         jobs: processes.
         out: file to which each result is appended as one line of JSON as soon as it is known. A result of the same
             run and the same code that the file already contains is not measured again. None: results are not saved.
-        reuse: whether to use results in ``out`` even if another version of the code measured them.
+        reuse: whether to keep results in ``out`` that another version of the code measured.
         progress: function called with the number of finished placements and the total number.
 
     Raises:
-        InputError: when a skill or an arm can't be loaded, ``out`` can't be written, or several processes are requested
-            without joblib.
+        InputError: when a skill or an arm can't be loaded, ``out`` can't be written, or ``jobs`` is above 1 and joblib
+            is not installed.
         FileFormatError: when ``out`` contains something else.
     """
     work = [Run(policy, setup, seed, max_tilt) for setup in setups for seed in seeds for policy in policies]

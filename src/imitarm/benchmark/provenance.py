@@ -49,7 +49,7 @@ def version_of(package: Path, installed: str) -> str:
 
 
 def origin(versions: Iterable[str]) -> str:
-    """Return a sentence that says which code made the results, and whether it differs from the running code.
+    """Return a sentence that says which version of the code made the results, and whether the running code differs.
 
     Args:
         versions: code version of each result, see :func:`code_version`.

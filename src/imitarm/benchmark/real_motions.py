@@ -85,8 +85,8 @@ def _person(word: str) -> list[Skeleton]:
 def tables(motions: Sequence[Motion]) -> list[Table]:
     """Return two tables.
 
-    The first is for ``modern``, with every motion, arm and playback speed. The second is for all methods, with the
-    first motion only.
+    The first table shows the method ``modern`` with every motion, arm and playback speed. The second table shows all
+    methods with the first motion only.
 
     Args:
         motions: at least one motion.
@@ -111,7 +111,7 @@ def tables(motions: Sequence[Motion]) -> list[Table]:
 
 
 class Start(NamedTuple):
-    """The input for retargeting a motion to an arm, with a start from which the whole motion is within reach.
+    """The input for retargeting a motion to an arm; from its start posture, the whole motion is within reach.
 
     The fields are the arm, the skeletons at the playback speed, the correspondence, the start posture (n_joints,)
     [rad], and the highest speed of the target [m/s].

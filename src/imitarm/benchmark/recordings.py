@@ -60,8 +60,8 @@ class Plan:
     Attributes:
         kind: one of :data:`KINDS`, or :data:`CAPTURED`.
         person: seed of the person; persons differ in limb lengths and habits.
-        repeat: number of the recording among the recordings of this person, 0 to 99. It seeds the motion and the
-            camera. For motion capture, it is the number of the simulated camera.
+        repeat: number of the recording among the recordings of this person, 0 to 99. The number also seeds the motion
+            and the camera. For motion capture, it is the number of the simulated camera.
         seconds: approximate duration of reaches and drawings [s]. Motion capture is cut to this duration; stacking
             ignores it.
         sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
@@ -307,7 +307,7 @@ def _between(frames: tuple[Skeleton, ...]) -> Truth:
 
 
 def beyond_reach(recording: MappingRecording, arm: ArmModel) -> float:
-    """Return the fraction of the time in which the target of the robot's wrist is farther away than the arm can reach.
+    """Return the fraction of the time in which the target of the robot's wrist is beyond the reach of the arm.
 
     The target is the start position plus the scaled displacement of the person's wrist. The tool is assumed to keep its
     orientation.

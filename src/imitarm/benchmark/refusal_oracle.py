@@ -2,19 +2,20 @@
 
 The oracle shares no code with the library's search for a path. The oracle gives one of three answers:
 
-* **impossible**: a proof. Either an obstacle covers a point that must not move. Or no chain of boxes of positions and
-  times leads from the start to the goal, see :mod:`imitarm.benchmark.refusal_proof`. Then no continuous displacement of
-  the path exists.
-* **possible**: a path was found and verified. A chain of free boxes leads from the start to the goal, or a chain of
-  free cells in a grid of displacements at many times, called layers. In the grid, a cell counts as free if its centre
-  is free. Tangents give a lower bound of the distance to the obstacles during moves between neighbouring cells and
-  between layers. Dynamic programming finds the chain with the smallest displacements. A sum of the skill's components
-  is then fitted to the chain. If the components are too wide for the fit, hat functions in time replace them.
-* **undecided**: even the finest grid and the smallest boxes gave neither a proof nor a path.
+* **impossible**: the oracle proved that no continuous displacement of the path avoids the obstacles. Either an obstacle
+  covers a point that must not move, or no chain of unblocked boxes in space and time leads from the start to the
+  goal (:mod:`imitarm.benchmark.refusal_proof`).
+* **possible**: the oracle found and verified a path. It searches in two ways. The first looks for a chain of free boxes
+  from the start to the goal. The second uses a grid of displacements at many times, called layers, and looks for a
+  chain of free cells. A cell of the grid counts as free if its centre is free. For moves between neighbouring cells and
+  between layers, tangents give a lower bound of the distance to the obstacles. Dynamic programming finds the chain with
+  the smallest displacements. A sum of the skill's components is then fitted to the chain. If the components are too
+  wide for the fit, the sum uses hat functions of time instead.
+* **undecided**: with the finest grid and the smallest boxes, the oracle found neither a proof nor a path.
 
-The oracle uses the same limits as the library. No sample is displaced by more than 0.5 m. No step is longer than 8
-times the longest step of the nominal path. At fixed times, the path is not displaced. No displacement has a component
-in a forbidden direction.
+The oracle uses the same limits as the library's own search. No sample is displaced by more than 0.5 m. No step is
+longer than 8 times the longest step of the nominal path. At fixed times, the path is not displaced. No displacement has
+a component in a forbidden direction.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ def decide(question: Question) -> tuple[Answer, Array | None]:
 
 
 def is_solved(question: Question) -> bool:
-    """Return whether a path is found and verified."""
+    """Return whether the oracle finds and verifies a path."""
     return _searched(question)[0] is Answer.POSSIBLE
 
 

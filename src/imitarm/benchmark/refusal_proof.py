@@ -1,16 +1,18 @@
-"""Proof that no path exists: a graph of cells, divided only where a path may still lead.
+"""Proof that no path exists: a graph of cells, which are divided only where a path may still pass.
 
-A *cell* is a box of positions of the tip and an interval of time. A cell is blocked only if this is certain for every
-position in the box at every time in the interval: then one inflated obstacle contains the tool's sphere throughout, or
-every position is displaced too far or in a forbidden direction. The inflated obstacle is convex. It therefore contains
-everything between points that it contains, and a few points suffice: the corners of the box that contains the sphere's
-centre at all times. A cell is free if, just as certainly, nothing can block any part of it.
+A *cell* is a box of positions of the tool's tip, together with an interval of time. A cell is blocked only if no
+position in the box is possible at any time in the interval. A cell can be blocked for two reasons. One inflated
+obstacle may contain the centre of the tool's sphere all the time. Or every position in the box may be displaced too far
+or in a forbidden direction. An inflated obstacle is convex, so it contains a box if it contains the corners of the box.
+The proof therefore tests only the corners of the box that contains the sphere's centre at all times of the interval. A
+cell is free if it is proved that nothing blocks any part of it.
 
 Two cells are neighbours if they have a position and a time in common. A path leads from cell to neighbouring cell, and
 never back in time. If the graph of all cells that are not blocked contains no route from the start to the goal, then no
-continuous displacement of the path keeps the path clear of the obstacles. Each round finds the routes that cross the
-fewest cells of which it is not known whether they are free, and divides these cells. Cells to which no route leads are
-left out. A route of free cells only ends the search, because then a path exists, except for the limit of its speed.
+continuous displacement keeps the path clear of the obstacles. A cell is undecided if it is neither blocked nor free.
+Each round finds the routes that cross the fewest undecided cells, and divides these cells. Cells to which no route
+leads are left out. If a route of free cells is found, the search ends: a path exists, although its speed may exceed the
+limit.
 """
 
 from __future__ import annotations
@@ -44,7 +46,7 @@ _MAX_FRAMES = 3
 
 
 class Answer(Enum):
-    """Answer to the question whether a path exists."""
+    """Possible answers to the question of whether a path exists."""
 
     IMPOSSIBLE = "impossible"
     POSSIBLE = "possible"
@@ -53,12 +55,13 @@ class Answer(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Exploration:
-    """What is known of one question.
+    """Result of the search for a proof or a route.
 
     Attributes:
-        answer: whether a route of free cells was found, or it is proved that no path exists.
-        route: times (m,) [s] and positions (m, 3) [m] of a path through free cells; None if no such path was found.
-            Only the speed along this path may be too high.
+        answer: POSSIBLE if a route of free cells was found, IMPOSSIBLE if the search proved that no path exists,
+            otherwise UNDECIDED.
+        route: times (m,) [s] and positions (m, 3) [m] of a path through free cells; None if no such path was found. The
+            path keeps every limit except, possibly, the limit of speed.
     """
 
     answer: Answer
@@ -70,8 +73,8 @@ def explored(question: Question, *, timed: bool) -> Exploration:
 
     Args:
         question: scene and path; at least one direction of displacement is permitted.
-        timed: whether cells are also divided in time. If False, all cells have the whole duration of a leg. This takes
-            little time, and suffices for most scenes in which nothing but the tip moves.
+        timed: whether cells are also divided in time. If False, every cell lasts for a whole leg. The search is then
+            fast, and finds an answer in most scenes in which only the tip moves.
     """
     found = Exploration(Answer.UNDECIDED)
     for frame in _frames(question, question.axes()):
@@ -230,10 +233,10 @@ class Cells:
         low: lowest coordinates, shape (n, d) [m].
         high: highest coordinates, shape (n, d) [m].
         level: level of the interval, shape (n,); an interval of this level is as long as the leg divided by 2^level.
-        at: number of the interval on its level, shape (n,).
-        depth: number of divisions from which the cell results, shape (n,).
+        at: number of the interval among the 2^level intervals of its level, shape (n,).
+        depth: how many times the cell's ancestors were divided, shape (n,).
         free: whether the cell is certainly free, shape (n,).
-        axis: axis along which the cell is divided next; d stands for time, shape (n,).
+        axis: index of the axis along which the cell is divided next, shape (n,); the index d stands for time.
     """
 
     low: Array
@@ -246,7 +249,7 @@ class Cells:
 
     @classmethod
     def unknown(cls, low: Array, high: Array, level: Index, at: Index, depth: Index) -> Cells:
-        """Return cells of which nothing is known yet."""
+        """Return new cells that are not yet known to be free."""
         n = len(level)
         return cls(low, high, level, at, depth, np.zeros(n, dtype=bool), np.zeros(n, dtype=np.intp))
 
@@ -254,7 +257,7 @@ class Cells:
         return len(self.level)
 
     def take(self, chosen: Index) -> Cells:
-        """Return some of the cells."""
+        """Return the cells with the given indices."""
         return Cells(**{name: values[chosen] for name, values in vars(self).items()})
 
     def __add__(self, other: Cells) -> Cells:
@@ -266,7 +269,7 @@ class Cells:
         return self.at * length, (self.at + 1) * length
 
     def touch(self, i: Index, j: Index) -> Bools:
-        """Return for pairs (m,) of cells whether they have a position and a time in common."""
+        """Return, for each pair of cells, whether the two cells have a position and a time in common, shape (m,)."""
         start, end = self.times()
         answer = (start[i] <= end[j]) & (start[j] <= end[i])
         for low, high in zip(self.low.T, self.high.T, strict=True):
@@ -274,7 +277,7 @@ class Cells:
         return np.asarray(answer)
 
     def contain(self, position: Array, time: float) -> Index:
-        """Return the cells that contain a position (d,) [m] at a time, a fraction of the leg."""
+        """Return the cells that contain a position (d,) [m] at a time, given as a fraction of the leg."""
         start, end = self.times()
         inside = np.all((self.low - _TOUCH <= position) & (position <= self.high + _TOUCH), axis=1)
         return np.flatnonzero(inside & (start <= time) & (time <= end))
@@ -343,7 +346,8 @@ def classified(leg: Leg, cells: Cells, *, timed: bool) -> tuple[Cells, Bools]:
     Args:
         leg: obstacles, limits and motion.
         cells: new cells.
-        timed: whether cells may be divided in time. If False, a limit that blocks a cell only at some time is ignored.
+        timed: whether cells may be divided in time. If False, a limit is ignored if it blocks the cell only at some
+            times.
 
     Returns:
         The cells, and whether each cell is blocked, shape (n,).

@@ -23,14 +23,14 @@ _ROUNDING = 1e-9  # [m]
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """The question whether a path exists in a scene, in the form that the oracle takes.
+    """The question of whether a path exists in a scene, in the form that the oracle takes.
 
     Attributes:
-        nominal: the nominal path, n samples.
+        nominal: the nominal path, with n samples.
         basis: influence of the skill's components on the samples, shape (n, n_components).
-        obstacles: obstacles at time 0; each obstacle moves with constant velocity.
+        obstacles: the obstacles at time 0 s; each obstacle moves with constant velocity.
         spheres: spheres that cover the tool, rows x y z radius in the tool's frame, shape (m, 4) [m].
-        clearance: required [m].
+        clearance: required clearance [m].
         forbidden: directions in which the path must not be displaced, shape (k, 3).
         fixed_times: times at which the path must not be displaced [s].
     """
@@ -44,7 +44,7 @@ class Question:
     fixed_times: tuple[float, ...]
 
     def at(self, times: Array) -> tuple[Array, Array]:
-        """Return the tip (m, 3) at times (m,), and the sphere centres relative to the tip (n_spheres, m, 3)."""
+        """Return positions of the tip (m, 3) at ``times``, and sphere centres relative to it (n_spheres, m, 3) [m]."""
         tip, quaternions = self.nominal.at(times)
         if quaternions is None:
             return tip, np.zeros((len(self.spheres), len(times), 3))
@@ -64,16 +64,16 @@ class Question:
 
 
 def separation(question: Question, times: Array, positions: Array) -> float:
-    """Return a proven lower bound of the distance along a path, minus the required clearance [m].
+    """Return a proven lower bound of the clearance along a path, minus the required clearance [m].
 
     For any unit vector u, a point p is at least ``u . p - max_x u . x`` away from a convex obstacle. The maximum over
-    all points x of the obstacle is its support function. The proof uses no other geometry code of the library; the
-    library's distance gradient only proposes u.
+    all points x of the obstacle is its support function. The proof uses no other geometry of the library, except that
+    the library's distance gradient proposes the vector u. Every u gives a valid bound.
 
     Args:
         question: obstacles, spheres and clearance.
         times: times of the path [s], shape (n,).
-        positions: positions of the tip, a polyline, shape (n, 3) [m].
+        positions: positions of the tip at these times, the corners of a polyline, shape (n, 3) [m].
     """
     dense = np.unique(np.concatenate([np.linspace(times[0], times[-1], _DENSE), times]))
     tip = np.stack([np.interp(dense, times, column) for column in positions.T], axis=1)
@@ -102,12 +102,13 @@ def covers_fixed_point(question: Question) -> bool:
 
 
 class Leg:
-    """The part of the motion between two neighbouring fixed times, at which the position of the tip is known.
+    """The part of the motion between two neighbouring fixed times; at a fixed time, the tip must not be displaced.
 
     The coordinates of a position are its components along ``frame``: first the d permitted directions, then the others.
-    The tip is displaced only along the former. Everything else that moves is known: the tip along the other directions,
-    the spheres relative to the tip, and the obstacles. A table contains, for each interval of time and each pair of an
-    obstacle and a sphere, the box of this known motion. Level l of the table divides the leg into 2^l intervals.
+    The tip is displaced only along the d permitted directions. Everything else that moves is known: the tip along the
+    other directions, the spheres relative to the tip, and the obstacles. A table contains a box for each interval of
+    time and each pair of an obstacle and a sphere. The box bounds the known motion of the sphere relative to the
+    obstacle. Level l of the table divides the leg into 2^l intervals.
 
     Args:
         question: scene and path.
@@ -117,8 +118,9 @@ class Leg:
 
     Attributes:
         dimension: number d of permitted directions.
-        frame: rows are unit vectors, the permitted ones first, shape (3, 3).
-        pairs: for each pair, its obstacle and the required distance of the sphere's centre from it [m].
+        frame: unit vectors as rows, first the permitted directions, shape (3, 3).
+        pairs: for each pair of an obstacle and a sphere, the obstacle and the distance that the sphere's centre must
+            keep from it [m].
         ends: coordinates of the tip at the start and at the end of the leg, shape (2, d) [m].
         one_sided: components of the forbidden directions along the permitted axes, shape (m, d).
     """
@@ -153,24 +155,24 @@ class Leg:
         self.one_sided = slopes[np.linalg.norm(slopes, axis=1) > 1e-9]
 
     def positions(self, coordinates: Array, times: Array) -> Array:
-        """Return the positions (m, 3) [m] of the tip with coordinates (m, d) at ``times`` (m,), parts of the leg."""
+        """Return positions (m, 3) [m] of the tip from coordinates (m, d) [m]; ``times`` (m,) are parts of the leg."""
         tip = self._question.at(self.start + times * (self.end - self.start))[0]
         axes = self.frame[: self.dimension]
         return np.asarray(tip + (coordinates - tip @ axes.T) @ axes)
 
     def nominal(self) -> tuple[Array, Array]:
-        """Return the times (n,) of the samples, as parts of the leg, and the undisplaced coordinates (n, d) [m]."""
+        """Return the times (n,) of the samples, as fractions of the leg, and the undisplaced coordinates (n, d) [m]."""
         samples = self._question.nominal.times
         samples = np.concatenate([[self.start], samples[(samples > self.start) & (samples < self.end)], [self.end]])
         tip = self._question.at(samples)[0]
         return (samples - self.start) / (self.end - self.start), tip @ self.frame[: self.dimension].T
 
     def tip_box(self, level: Index, at: Index) -> tuple[Array, Array]:
-        """Return the box of the undisplaced tip in intervals (n,) of time: lowest and highest coordinates (n, d)."""
+        """Return the box of the undisplaced tip in n intervals of time: lowest and highest coordinates (n, d) [m]."""
         return _looked_up(self._tip[0], level, at), _looked_up(self._tip[1], level, at)
 
     def motion_box(self, level: Index, at: Index) -> tuple[Array, Array]:
-        """Return the boxes of the known motion in intervals (n,) of time: two corners of each, (n, n_pairs, 3)."""
+        """Return the boxes of the known motion in n intervals: lowest and highest corners (n, n_pairs, 3) [m]."""
         return _looked_up(self._motion[0], level, at), _looked_up(self._motion[1], level, at)
 
 

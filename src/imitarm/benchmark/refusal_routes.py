@@ -34,9 +34,9 @@ def short(start: Array, end: Array, low: Array, high: Array) -> Array:
 
 
 def even(points: Array, earliest: Array, latest: Array) -> Array:
-    """Return times (m + 2,) from 0 to 1 at which the points are passed as evenly as possible.
+    """Return times (m + 2,) from 0 to 1 at which a path passes the points, at a speed as even as possible.
 
-    The m points between the ends are passed between the times ``earliest`` and ``latest``, both of shape (m,).
+    The path passes each of the m points between the ends at a time from ``earliest`` to ``latest``, both of shape (m,).
     """
     m = len(points) - 2
     earliest = np.maximum.accumulate(earliest)
@@ -57,11 +57,11 @@ def even(points: Array, earliest: Array, latest: Array) -> Array:
 
 
 def beside(route: Array, times: Array, nominal: Array) -> tuple[Array, Array]:
-    """Follow a route so that the displacement from the nominal path is small at all times.
+    """Return a path along a route that stays near the nominal path at all times.
 
-    Dynamic programming finds the point of the route for each sample. It minimises the sum of the squared displacements
-    and of the weighted squared steps along the route. The path never goes backwards on the route, and no step is longer
-    than permitted.
+    For each sample, dynamic programming chooses a point of the route. The cost is the sum of the squared displacements
+    from the nominal path, plus the weighted squared steps along the route. The path never goes backwards on the route,
+    and no step is longer than permitted.
 
     Args:
         route: corners of a polyline, shape (m, d) [m].
@@ -69,7 +69,8 @@ def beside(route: Array, times: Array, nominal: Array) -> tuple[Array, Array]:
         nominal: nominal path at the samples, shape (n, d) [m].
 
     Returns:
-        Times (n,) and points (n, d) [m] of the path. If no such path is quick enough, it is followed at constant speed.
+        Times (n,) and points (n, d) [m] of the path. If no such path reaches the end in time, the path follows the
+        route at constant speed.
     """
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(route, axis=0), axis=1))])
     at = np.linspace(0.0, length[-1], _POINTS)
@@ -95,6 +96,6 @@ def beside(route: Array, times: Array, nominal: Array) -> tuple[Array, Array]:
 
 
 def at_samples(nominal: Trajectory, times: Array, positions: Array) -> tuple[Array, Array]:
-    """Return the times (n,) and displacements (n, 3) [m] of the samples of a polyline: ``positions`` at ``times``."""
+    """Sample a polyline of ``positions`` at the nominal times; return these times (n,) and displacements (n, 3) [m]."""
     moved = np.stack([np.interp(nominal.times, times, column) for column in positions.T], axis=1)
     return nominal.times, moved - nominal.positions

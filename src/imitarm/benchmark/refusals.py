@@ -1,7 +1,7 @@
 """``imitarm benchmark refusals``: let ``adapt`` plan in random scenes, and check its paths and refusals.
 
-The scenes may have no solution. The obstacles, the tool, the required clearance, the forbidden directions and the
-number of samples are all random, so that the scenes reach cases that no one would think of. An oracle,
+Some scenes have no solution. The obstacles, the tool, the required clearance, the forbidden directions and the number
+of samples are all random. The scenes therefore include unusual cases. An oracle,
 :mod:`imitarm.benchmark.refusal_oracle`, decides independently whether a path exists.
 """
 
@@ -49,7 +49,7 @@ class RandomScene:
         family: name of the rule by which the obstacles were placed.
         scene: obstacles, some of which may move.
         tool_spheres: spheres that cover the tool, rows x y z radius in the tool's frame, shape (m, 4) [m].
-        clearance: required [m].
+        clearance: required clearance [m].
         forbidden: directions in which the path must not be displaced, shape (m, 3).
         pinned: times at which the path must not move [s].
         n_samples: number of samples along the path.
@@ -75,7 +75,7 @@ def random_scene(seed: int, path: Array, duration: float, *, rotates: bool) -> R
         seed: number of the scene.
         path: nominal path, shape (n, 3) [m].
         duration: duration of the path [s].
-        rotates: whether the skill rotates the tool. If False, the tool has no spheres away from the tip.
+        rotates: whether the skill rotates the tool. If False, all spheres of the tool are centred at the tip.
     """
     rng = np.random.default_rng([31, seed])
     family = RANDOM_FAMILIES[int(rng.choice(len(RANDOM_FAMILIES), p=[0.1, 0.1, 0.3, 0.12, 0.06, 0.06, 0.16, 0.1]))]
@@ -255,7 +255,8 @@ class Verdict:
         seed: number of the scene.
         family: name of the rule by which the obstacles of the scene were placed.
         accepted: whether the library found a feasible adaptation.
-        margin: proven lower bound of the distance along an accepted path, minus required clearance [m]; nan if refused.
+        margin: proven lower bound of the clearance of an accepted path, minus the required clearance [m]; nan if
+            refused.
         oracle: the oracle's answer to the question whether a path exists. If ``accepted``, the answer is "possible" or
             "undecided", because the oracle then does not try to prove that no path exists.
         seconds: compute time of the adaptation [s].
@@ -317,7 +318,7 @@ def adapted(skill: Skill, case: RandomScene | StaticCase) -> Adaptation:
 
 
 def evaluate_scene(skill: Skill, seed: int) -> Verdict:
-    """Adapt a skill to one random scene, and check with the oracle whether the path or the refusal is right."""
+    """Adapt a skill to one random scene, and let the oracle check the path or the refusal."""
     case = scene_for(skill, seed)
     adaptation = adapted(skill, case)
     question = question_of(skill, case)
@@ -371,7 +372,7 @@ def _note(verdicts: Sequence[Verdict]) -> str:
     if accepted:
         solved = sum(v.oracle is Answer.POSSIBLE for v in accepted)
         margin = 1e6 * min(v.margin for v in accepted)
-        parts.append(f"The clearance of each accepted path exceeds the required clearance by at least {margin:.2f} um.")
+        parts.append(f"The clearance of each accepted path exceeds the required clearance by at least {margin:.2f} µm.")
         parts.append(f"The oracle solves {100 * solved / len(accepted):.1f} % of the accepted scenes.")
     if refused:
         right = sum(v.oracle is Answer.IMPOSSIBLE for v in refused)

@@ -31,8 +31,8 @@ class RepeatedTask(NamedTuple):
         title: title of the table.
         arm: function that loads the arm.
         run: function that runs the task with a seed, an arm and the name of an observer.
-        observers: names of the ways to observe the obstacles.
-        success: when a run counts as a success.
+        observers: names of the sensor models that can observe the obstacles.
+        success: text that says when a run counts as a success.
     """
 
     title: str
@@ -94,7 +94,7 @@ class TaskResult:
         outcome: ``"success"`` or ``"failed"``.
         reason: explanation.
         values: ``duration`` of the run [s]; ``clearance``, the smallest measured distance of the arm from an obstacle
-            [m]; ``avoiding``, the fraction of the steps in which the policy evaded something.
+            [m]; ``avoiding``, the fraction of the control steps in which the policy avoided an obstacle.
     """
 
     experiment: TaskExperiment
@@ -176,8 +176,8 @@ def success_tables(results: Sequence[TaskResult]) -> list[Table]:
     )
     columns = ("observer", "success>", "95 % interval [%]>", "duration [s]>", "least clearance [mm]>", "avoiding [%]>")
     note = (
-        f"Success: {task.success}. Duration: median. "
-        "Avoiding: fraction of the control steps in which the policy evaded something."
+        f"Success: {task.success}. Duration: median. Avoiding: fraction of the control steps in which the policy "
+        "avoided an obstacle."
     )
     tables = [Table(task.title, columns, (row,), note)]
     failed = tuple((str(result.experiment.seed), result.reason) for result in results if not result.success)

@@ -19,7 +19,7 @@ SUFFIX = ".jsonl"
 
 @dataclass(frozen=True)
 class ResultFormat(Generic[Work, Outcome]):
-    """How the results of one benchmark are written: one line of JSON for each.
+    """File format of the results of one benchmark: each result is one line of JSON.
 
     A result has the attributes ``experiment``, ``code``, ``outcome``, ``reason`` and ``values``, in this order; an
     experiment is a dataclass with an attribute ``method``.
@@ -28,7 +28,7 @@ class ResultFormat(Generic[Work, Outcome]):
         name: name and version of the format.
         experiment: class of the experiments.
         outcome: class of the results.
-        command: command that makes a folder of results, for messages.
+        command: command that makes a folder of results; error messages name it.
     """
 
     name: str
@@ -41,7 +41,7 @@ class ResultFormat(Generic[Work, Outcome]):
 
         Args:
             folder: the folder; created if missing.
-            reuse: whether a result of another version of the code is valid.
+            reuse: whether to use saved results of another version of the code.
 
         Raises:
             InputError: when the folder can't be written to.
@@ -118,8 +118,8 @@ class LineStore(Store[Work, Outcome]):
 
     Args:
         folder: the folder; created if missing.
-        form: how a result is written.
-        reuse: whether a result of another version of the code is valid.
+        form: file format of a result.
+        reuse: whether to use saved results of another version of the code.
 
     Raises:
         InputError: when the folder can't be written to.
@@ -135,7 +135,7 @@ class LineStore(Store[Work, Outcome]):
             ) from error
 
     def known(self, experiments: Sequence[Work]) -> dict[Work, Outcome]:
-        """Return the saved results; results that are unreadable or (without ``reuse``) of other code are left out."""
+        """Return the saved results; without ``reuse``, results of other code are left out, as are unreadable lines."""
         wanted = set(experiments)
         found: dict[Work, Outcome] = {}
         for method in dict.fromkeys(_method(e) for e in experiments):

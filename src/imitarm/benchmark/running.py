@@ -1,8 +1,8 @@
 """Run many experiments in parallel; each result is saved immediately, so an interrupted benchmark can be continued.
 
-The experiments of every benchmark run here. A benchmark supplies the function that runs one experiment, and a store
-that saves results. Only the main process saves results. Therefore the processes that run the experiments may be on
-other machines, and need no common folder.
+Every benchmark runs its experiments with :func:`run_experiments`. A benchmark supplies the function that runs one
+experiment, and a store that saves results. Only the main process saves results. Therefore the processes that run the
+experiments may be on other machines, and need no common folder.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from imitarm.benchmark.provenance import code_version
 from imitarm.errors import InputError, TaskFailedError
 
 LOCAL, DASK = "loky", "dask"
-"""Two backends: processes of this machine (by joblib), and the workers of a Dask scheduler."""
+"""Names of two backends. The first uses processes of this machine (joblib), the second uses Dask workers."""
 _CONNECT = 10.0  # [s] until a scheduler must answer
 _SILENCE = 5.0  # [s] between two checks whether the scheduler is still there
 _AHEAD = 3  # experiments that each worker of a scheduler has waiting
@@ -50,7 +50,7 @@ class Store(ABC, Generic[Work, Outcome]):
 
     @abstractmethod
     def save(self, experiment: Work, outcome: Outcome) -> Outcome:
-        """Save one result, so that :meth:`known` finds either the whole result or nothing.
+        """Save one result; even if the process is killed, :meth:`known` finds the whole result or no result.
 
         Returns:
             The result as :meth:`known` would return it.
@@ -70,7 +70,7 @@ class Workers:
         scheduler: address of the Dask scheduler, such as ``tcp://10.0.0.1:8786``; only for :data:`DASK`.
 
     Raises:
-        InputError: when there is a scheduler without the backend for it, or the reverse.
+        InputError: when a scheduler is given for another backend than Dask, or the Dask backend has no scheduler.
     """
 
     jobs: int | None = None
@@ -137,7 +137,7 @@ def run_experiments(
 def in_parallel(
     function: Callable[[Work], Outcome], works: Sequence[Work], workers: Workers | None = None
 ) -> Generator[tuple[Work, Outcome], None, None]:
-    """Call a function for each experiment, in parallel; yield each with its result as soon as it is available.
+    """Call a function for each experiment, in parallel; yield each experiment and its result as soon as it is done.
 
     Raises:
         InputError: when the backend does not exist.

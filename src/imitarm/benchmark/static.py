@@ -39,7 +39,7 @@ VARIANTS: Mapping[str, tuple[str, Options]] = {
     "acfra-literal": ("acfra", (("method", "literal"),)),
     "acfra-mapf": ("acfra", (("method", "mapf"),)),
 }
-"""Methods with fixed options: ACFRA with the thesis's potential as printed (Eq 4.7), and with the corrected one."""
+"""ACFRA with fixed options: ``literal`` uses the thesis's potential as printed (Eq 4.7), ``mapf`` corrects it."""
 _WHOLE_ARM = ("rrt-connect", "rrt-connect-tilt")  # these plan joints only, so they need an arm
 _TOOL_ON_ARM = np.array([0.65, 0.0, 0.30])  # [m] where the middle of a path is put in front of the Sawyer
 _POSTURES = 100  # along the path, for torques
@@ -85,7 +85,7 @@ def build(method: str, case: StaticCase, options: Options = ()) -> PathPolicy:
 
 @dataclass(frozen=True)
 class StaticExperiment:
-    """One method in one scene; plain values that can be sent to another process or machine.
+    """One method in one scene. All values are plain, so another process or machine can run the experiment.
 
     Attributes:
         family: one of :data:`~imitarm.benchmark.static_scenes.FAMILIES`.
@@ -94,8 +94,9 @@ class StaticExperiment:
         method: one of :func:`method_names`.
         teachers: number of teachers from whom the skill was learned.
         options: options that replace the defaults of the method, such as those found by tuning.
-        torque: whether the torques of a Sawyer are computed as well, which takes most of the time.
-        memory: whether the peak memory of a second, untimed plan is measured, which takes several times as long.
+        torque: whether to compute the torques of a Sawyer, too. This takes most of the computing time.
+        memory: whether the method plans a second time, without a clock, to measure its peak memory. This plan takes
+            several times as long.
         skill: file of the skill on whose path the obstacles stand; empty: the family's own skill.
 
     Raises:
@@ -128,7 +129,7 @@ class StaticExperiment:
 
     @property
     def scene(self) -> tuple[str, int, int, int, str]:
-        """What experiments of different methods in the same scene have in common."""
+        """The key of the scene; experiments of different methods in the same scene have the same key."""
         return self.family, self.dimension, self.seed, self.teachers, self.skill
 
     def case(self) -> StaticCase:
@@ -143,10 +144,10 @@ class StaticExperiment:
     def run(self) -> StaticResult:
         """Let the method plan in its scene, and measure the planned path.
 
-        Every plan is slowed down where the tool would exceed its limits of speed or acceleration.
+        Each plan is slowed down wherever the tool would exceed its limit of speed or acceleration.
 
         Returns:
-            The result. An error of the method is the outcome "failed"; the reason says which one.
+            The result. If the method raises an error, the outcome is "failed", and the reason contains the error.
         """
         values: dict[str, Any] = {}
         try:
@@ -216,8 +217,8 @@ class StaticResult:
         reason: explanation of the outcome; empty after a success.
         values: measures by name: those of :class:`~imitarm.benchmark.static_measures.PathMeasures`; ``n_obstacles``;
             ``must_refuse`` of the scene; ``build_seconds``, ``plan_seconds`` and ``plan_cpu`` (processor time) [s];
-            ``unmoved`` (fraction of the components, for methods with components); ``answer`` of the oracle;
-            ``torque_rms`` [N m], ``torque_peak`` (relative to the rated torque); ``peak_memory`` [bytes].
+            ``unmoved`` (fraction of the skill's components that the method did not move); ``answer`` of the oracle;
+            ``torque_rms`` [N m], ``torque_peak`` (divided by the rated torque); ``peak_memory`` [bytes].
     """
 
     experiment: StaticExperiment
@@ -263,12 +264,12 @@ def run_experiment(experiment: StaticExperiment) -> StaticResult:
 def torques_on_sawyer(trajectory: Trajectory) -> dict[str, float]:
     """Return the joint torques of a Sawyer whose tool follows a path, by inverse kinematics and inverse dynamics.
 
-    The path is turned by 90 degrees about the vertical axis, so that its x axis runs sideways in front of the arm, and
-    its middle is put 0.65 m in front of the base. The tool points down.
+    The path is rotated by 90 degrees about the vertical axis, so that its x axis runs sideways in front of the arm. The
+    middle of the path is 0.65 m in front of the base. The tool points down.
 
     Returns:
         ``torque_rms``: root mean square over time of the norm of the joint torques [N m]; ``torque_peak``: largest
-        torque relative to the rated torque of its joint. Both are nan if the arm can't reach the path.
+        torque divided by the rated torque of its joint. Both are nan if the arm can't reach the path.
     """
     arm = _sawyer()
     even = trajectory.resample(_POSTURES)

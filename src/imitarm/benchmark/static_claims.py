@@ -42,14 +42,14 @@ _TOY = 0.02  # rate of success of "no avoidance" above which the scenes are void
 _LEVEL = 0.05  # of significance
 
 Found = tuple[str, str]
-"""What was found, and whether the claim held."""
+"""Two texts: the measured values, and whether the claim holds."""
 _NOT_RUN: Found = ("not run", "–")
 
 
 def cost_law(results: StaticResults, row: str = OURS) -> tuple[float, float, int]:
-    """Return the exponent of the processor time over the number of obstacles, its standard error, and the sample.
+    """Return the exponent b of the processor time, its standard error, and the number of plans.
 
-    The exponent b is that of the power law ``time = a n^b``, fitted to the logarithms by least squares.
+    The power law ``time = a n^b`` is fitted to the logarithms by least squares; n is the number of obstacles.
     """
     found = [r for r in results.of(row, results.usual) if r.value("plan_cpu") > 0.0 and r.value("n_obstacles") >= 1.0]
     x = np.log([r.value("n_obstacles") for r in found])
@@ -63,12 +63,12 @@ def cost_law(results: StaticResults, row: str = OURS) -> tuple[float, float, int
 
 
 def claims_table(results: StaticResults) -> Table:
-    """Return a table of the thesis's claims and of the checks of the benchmark: what was found, and whether it held."""
+    """Return a table of the thesis's claims and of the benchmark's own checks: the result, and whether it held."""
     rows = [(claim, *evaluate(results)) for claim, evaluate in _CLAIMS]
     note = (
         "A claim holds if every method that was run for it supports it; a difference in the paired comparison counts "
-        f"when its p-value after Holm's correction is below {_LEVEL:g}. Methods with tuned options are used where they "
-        "were run, otherwise the default options."
+        f"when its p-value after Holm's correction is below {_LEVEL:g}. If a method was run with tuned options, these "
+        "results are used; otherwise, the results with default options are used."
     )
     return Table("Claims of the thesis, and checks", ("claim or check", "found", "held?"), tuple(rows), note)
 
@@ -268,7 +268,7 @@ _CLAIMS: tuple[tuple[str, Callable[[StaticResults], Found]], ...] = (
 
 
 def static_tables(results: StaticResults) -> list[Table]:
-    """Return all tables for which there are results; the table on the claims comes first."""
+    """Return every table that has results; the table on the claims comes first."""
     families = results.families()
     found = [claims_table(results)]
     if any(family == TASKS_FAMILY for family, _ in families):

@@ -46,7 +46,7 @@ READINGS = {
     "GMM+IRL": ("gmm-irl",),
     "ACFRA": ("acfra", "acfra-mapf", "acfra-literal"),
 }
-"""Our methods for each column of Table 4.1."""
+"""For each column of Table 4.1 of the thesis, the methods of this library that stand for it."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +56,14 @@ class Pairing:
     Attributes:
         row: the other method.
         scenes: number of scenes in which both were run.
-        only_ours: number of scenes in which only ours succeeds.
-        only_other: number of scenes in which only the other succeeds.
+        only_ours: number of scenes in which :data:`OURS` succeeds and the other method does not.
+        only_other: number of scenes in which the other method succeeds and :data:`OURS` does not.
         p_success: p-value of McNemar's exact test.
-        both: number of scenes in which both succeed.
-        difference: mean difference of the RMSE in these scenes, ours minus the other [m]; nan without any.
-        low: lower end of its 95 % interval.
-        high: upper end.
+        both: number of scenes in which both methods succeed.
+        difference: mean of the RMSE of :data:`OURS` minus the RMSE of the other method, over the scenes in which both
+            succeed [m]; nan if there is no such scene.
+        low: lower end of the 95 % interval of ``difference`` [m].
+        high: upper end of this interval [m].
         p_rmse: p-value of Wilcoxon's signed-rank test.
     """
 
@@ -88,7 +89,7 @@ def mcnemar(only_first: int, only_second: int) -> float:
 
 
 def signed_rank(differences: Array) -> float:
-    """Return the p-value of Wilcoxon's signed-rank test that differences are symmetric about 0; 1 without any."""
+    """Return the p-value of Wilcoxon's signed-rank test that differences are symmetric about 0; 1 if all are 0."""
     from scipy.stats import wilcoxon  # noqa: PLC0415 (takes long to import)
 
     nonzero = differences[differences != 0.0]
@@ -96,7 +97,7 @@ def signed_rank(differences: Array) -> float:
 
 
 def pairing(results: StaticResults, row: str, wanted: Callable[[Scene], bool]) -> Pairing:
-    """Compare :data:`OURS` with another row in the scenes that have a solution."""
+    """Compare :data:`OURS` with the method of another row, in the scenes that have a solution."""
     pairs = [
         (rows[OURS], rows[row])
         for scene, rows in results.by_scene.items()
@@ -142,7 +143,7 @@ def pairings(results: StaticResults, wanted: Callable[[Scene], bool]) -> list[Pa
 
 
 def paired_table(results: StaticResults) -> Table:
-    """Return a table that compares :data:`OURS` with each other method in pairs, in all families and in each."""
+    """Return a table that compares :data:`OURS` with each other method, in all families together and in each family."""
     rows = []
     for family in [None, *results.families()]:
         for p in pairings(results, lambda s, f=family: results.usual(s) and f in (None, s[:2])):  # type: ignore[misc]
@@ -206,9 +207,9 @@ def printed_table(results: StaticResults) -> Table:
                 rows.append((row, *cells, mean(means, 1.0, 4)))
     note = (
         "Printed values: thesis Table 4.1, which states no unit, no number of failures and no spread; the printed "
-        "average of DMP+ANN is 0.224, ten times the mean of its column. Ours: mean RMSE of the successes [m], in "
-        "brackets how many of the scenes succeeded; each scene moves the obstacles of its task a little. Where a "
-        "method fails, its mean is over fewer scenes than those of the other methods."
+        "average of DMP+ANN is 0.224, ten times the mean of its column. Ours: mean RMSE of the successes [m], and in "
+        "brackets the number of scenes in which the method succeeded. In each scene, the obstacles of the task are "
+        "moved a little. Where a method fails, its mean is over fewer scenes than those of the other methods."
     )
     return Table(
         "Table 4.1 of the thesis, and ours: RMSE", ("method", *(f"{t}>" for t in tasks), "average>"), tuple(rows), note

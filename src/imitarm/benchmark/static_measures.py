@@ -25,17 +25,18 @@ Array = NDArray[np.float64]
 DENSE = 4000
 """Number of points, evenly spaced in time, at which distances are measured."""
 NEAR = 0.10
-"""Distance of the tool on the learned path from an obstacle [m]; samples that are farther away count as unaffected."""
+"""A sample of the learned path is unaffected if the tool there is farther than this from every obstacle [m]."""
 AT_GOAL = 0.005
-"""Largest permitted distance from start, goal and contact points, and into a forbidden direction [m]."""
+"""Largest permitted distance from start, goal and contact points, and largest displacement in a forbidden direction
+[m]."""
 LATEST = 2.0
-"""Longest permitted duration, relative to the learned duration."""
+"""Longest permitted duration, divided by the learned duration."""
 MAX_SPEED, MAX_ACCELERATION = 1.7, 13.0
 """Largest speed [m/s] and acceleration [m/s^2] of the tool: the Cartesian limits that the manufacturer states for the
-Panda. A plan that exceeds them is first slowed down where it does (:meth:`~imitarm.policies.PathPlan.within`). If that
-does not suffice, it is executed more slowly at all times by the same factor. Neither changes the path."""
+Panda. A plan that exceeds a limit is first slowed down at these times (:meth:`~imitarm.policies.PathPlan.within`). If
+that does not suffice, the whole plan is slowed down by one factor. Slowing down does not change the path."""
 SLACK = 0.0005
-"""A path also counts as keeping the required clearance if it is nearer to an obstacle by at most this much [m]."""
+"""Tolerance of the required clearance [m]: a path keeps it if its clearance is at most this much smaller."""
 _SAMPLES = 200  # of the learned path, and of a planned path for speed, acceleration and smoothness
 
 
@@ -45,27 +46,28 @@ class PathMeasures:
 
     Attributes:
         clearance: smallest distance of the tool from an obstacle, at :data:`DENSE` points [m].
-        separation: lower bound of the same distance by supporting planes, which uses no distance function [m].
+        separation: lower bound of ``clearance`` from supporting planes, computed without a distance function [m].
         start_error: distance of the first position from the learned start [m].
         goal_error: distance of the last position from the goal [m].
-        contact_error: largest distance of the path from a pinned point of the learned path [m]; 0 without such points.
-        forbidden: largest displacement in a forbidden direction, over all samples [m]. The displacement of a sample is
-            measured from two points of the learned path, the nearest one and the one at the same fraction of the
-            duration, and the smaller of the two values counts.
+        contact_error: largest distance of the path from a pinned point of the learned path [m]; 0 if no point is
+            pinned.
+        forbidden: largest displacement in a forbidden direction, over all samples [m]. It is measured from the nearest
+            point of the learned path, and from the point at the same fraction of the duration; the smaller value
+            counts.
         max_speed: largest speed as planned [m/s].
         max_acceleration: largest acceleration as planned [m/s^2].
-        slowdown: factor by which the execution must be slower than planned, so that speed and acceleration are within
-            their limits, at least 1.
-        duration: duration of the execution, which is ``slowdown`` times that of the plan [s].
+        slowdown: factor, at least 1, by which the execution is slower than the plan. It keeps speed and acceleration
+            within their limits.
+        duration: duration of the execution, which is ``slowdown`` times the duration of the plan [s].
         duration_ratio: ``duration`` divided by the learned duration.
         rmse: root mean square distance from the learned path at equal fractions of the durations [m] (thesis Eq 4.9,
             with the square root).
-        rmse_unaffected: the same over those samples of the learned path at which the tool is farther than :data:`NEAR`
-            from every obstacle [m]; nan if there is none.
-        path_rmse: root mean square distance of the samples of the learned path from the nearest point of the path,
-            which does not depend on the timing [m].
-        deviation: largest displacement in standard deviations of the demonstrations (Mahalanobis distance).
-        length_ratio: path length divided by that of the learned path.
+        rmse_unaffected: like ``rmse``, but only over the samples of the learned path at which the tool is farther than
+            :data:`NEAR` from every obstacle [m]; nan if there is no such sample.
+        path_rmse: root mean square distance from each sample of the learned path to the nearest point of the planned
+            path, whatever the timing [m].
+        deviation: largest displacement, measured in standard deviations of the demonstrations (Mahalanobis distance).
+        length_ratio: path length divided by the length of the learned path.
         sparc: spectral arc length of the speed; the closer to 0, the smoother.
         ldlj: logarithmic dimensionless jerk; the closer to 0, the smoother.
     """
@@ -139,7 +141,7 @@ def _dense(trajectory: Trajectory) -> Trajectory:
 
 
 def evenly(trajectory: Trajectory) -> Trajectory:
-    """Return 200 evenly spaced samples of a cubic spline through the samples.
+    """Fit a cubic spline through the samples of a trajectory, and return it at 200 evenly spaced times.
 
     All methods get the same number of samples, so that finite differences treat them alike.
     """
@@ -236,7 +238,8 @@ def outcome(case: StaticCase, found: PathMeasures) -> tuple[str, str]:
 
 OUTCOMES = ("success", "too near", "contact", "missed goal", "late", "limit", "refused", "failed")
 """Possible outcomes: "success"; "too near" (a success, but nearer to an obstacle than required); "contact"; "missed
-goal" (also the start or a contact point, or a displacement in a forbidden direction); "late"; "limit" (late because of
-the limits of speed and acceleration); "refused" (before any motion); "failed" (the method raised an error)."""
+goal" (the path misses the goal, the start or a contact point, or moves in a forbidden direction); "late"; "limit" (late
+because of the limits of speed and acceleration); "refused" (before any motion); "failed" (the method raised an
+error)."""
 SUCCESSES = OUTCOMES[:2]
 """Outcomes that count as success: no contact, and goal reached in time within the limits of speed and acceleration."""

@@ -1,6 +1,6 @@
 """The results of the static benchmark as one self-contained HTML page: charts, tables, and playback of failures.
 
-The experiments are deterministic, so a path to be drawn is planned again; results hold no paths.
+Results hold no paths. The experiments are deterministic, so the report repeats each plan that it draws.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ def _sweep() -> Skill:
 
 
 def scaling_case(n_obstacles: int, n_spheres: int, seed: int) -> StaticCase:
-    """Return a scene with these numbers of obstacles and spheres; it contains the obstacles of scenes with fewer."""
+    """Return a scene with these numbers of obstacles and spheres; a larger number only adds obstacles or spheres."""
     skill, rng = _sweep(), np.random.default_rng([41, seed])
     path = skill.nominal(np.linspace(0.0, skill.duration_, 400)).positions
     free = _RADIUS + _LENGTH + CLEARANCE + _FREE
@@ -109,7 +109,7 @@ def exponent(plans: Sequence[Plan]) -> tuple[float, float]:
 def scaling_tables(
     methods: Sequence[str], seeds: Sequence[int], on_done: Callable[[int, int], None] | None = None
 ) -> list[Table]:
-    """Return two tables: over the number of obstacles (one sphere), and over the number of spheres (two obstacles).
+    """Return two tables: one for a varying number of obstacles, and one for a varying number of spheres.
 
     Args:
         methods: names of the methods.
@@ -133,8 +133,8 @@ def scaling_tables(
             rows.append((method, *_cells(plans, many)))
         columns = ("method", *(f"{n}>" for n in many), "exponent (standard error)>")
         note = (
-            "Median processor time of a plan [ms], in brackets the rate of success in percent with its Wilson "
-            "interval. The exponent is that of the power law fitted to all plans."
+            "Median processor time of a plan [ms], and in brackets the rate of success in percent with its Wilson "
+            "interval. The exponent belongs to a power law, which is fitted to all plans."
         )
         title = f"Time and success over the number of {what}, {len(seeds)} scenes each"
         tables.append(Table(title, columns, tuple(rows), note))

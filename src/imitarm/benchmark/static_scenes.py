@@ -1,15 +1,15 @@
-"""Static scenes of ``imitarm benchmark static``: families of obstacles, each of which makes avoidance hard in its way.
+"""Static scenes of ``imitarm benchmark static``: each family of obstacles is a different difficulty.
 
-| family | obstacles | known by construction |
+| family | obstacles | known from the construction of the scene |
 |---|---|---|
 | S1 | sparse: 1 or 2 spheres and boxes on the path | solvable |
-| S2 | dense: 4 to 8 spheres and boxes on and beside the path | - |
+| S2 | dense: 4 to 8 spheres and boxes on and beside the path | nothing |
 | S3 | mixed: 1 to 3 obstacles of all shapes on the path | solvable |
 | S4 | a wall with a gap, 1.2 to 3 times as wide as the tool | solvable, or not |
 | S5 | a trap: three boxes in the shape of a U that opens towards the path, 5 to 20 cm deep | solvable |
 | S6 | an obstacle over the start, the goal or a contact point | not solvable |
-| S7 | the sweep around 2 to 4 boxes and cones: the scenes T1 to T8 with small changes | - |
-| S9 | reach into an open box, with 1 to 3 obstacles on the path | - |
+| S7 | the sweep around 2 to 4 boxes and cones: the scenes T1 to T8 with small changes | nothing |
+| S9 | reach into an open box, with 1 to 3 obstacles on the path | nothing |
 
 S1 to S6 are scenes around an S-shaped reach, S7 around the sweep of :class:`~imitarm.tasks.sweep.SweepTask`, and S9
 around the reach of :class:`~imitarm.tasks.open_box.OpenBoxTask`. Scenes for the whole arm (S8) are in
@@ -79,12 +79,13 @@ class StaticCase:
         dimension: 2 when the path may only be displaced horizontally, else 3.
         seed: number of the scene.
         skill: the skill whose path is blocked.
-        scene: the obstacles; start and goal are the learned ones.
+        scene: the obstacles; the motion has the learned start and goal.
         tool_spheres: spheres that cover the tool, rows x y z radius in the tool's frame, shape (m, 4) [m].
         clearance: required [m].
         forbidden: directions in which the path must not be displaced.
         pinned: times at which the path must not be displaced, because the tool meets something there [s].
-        must_refuse: whether no path exists, where the construction of the scene tells; else None.
+        must_refuse: True if no path exists, False if a path exists; None if the construction of the scene does not
+            tell.
         n_samples: number of samples along the path.
     """
 
@@ -175,10 +176,10 @@ def static_case(
     Args:
         family: one of :data:`FAMILIES`.
         dimension: 2 when the path may only be displaced horizontally, else 3.
-        seed: number of the scene; :data:`SPLITS` says what it may be used for.
+        seed: number of the scene; :data:`SPLITS` says which seeds are for training, for tuning and for testing.
         teachers: number of teachers from whom the skill was learned.
         skill: another skill, for the families in :data:`ANY_SKILL`.
-        n_obstacles: number of obstacles, for S2; None: at random.
+        n_obstacles: number of obstacles, only for the family S2; None: a random number.
 
     Raises:
         UnknownNameError: when there is no such family.

@@ -1,6 +1,6 @@
 """Tables of the static benchmark: scenes, success, refusals, quality of the paths, computing time.
 
-A method with tuned options is a row of its own. The rate of success counts only the scenes that the oracle solves; the
+A method with tuned options has its own row. The rate of success counts only the scenes that the oracle solves; the
 first table states how many scenes this excludes.
 """
 
@@ -27,7 +27,7 @@ OURS = "acfra"
 ORACLE = "oracle"
 POSSIBLE, IMPOSSIBLE, UNDECIDED = "possible", "impossible", "undecided"
 TASKS_FAMILY, N_TASKS = "S7", 8
-"""The family of the sweeping tasks T1 to T8, and their number; the seed s belongs to the task T(1 + s modulo 8)."""
+"""The family of the sweeping tasks T1 to T8, and the number of tasks. The seed s gives the task T(1 + s modulo 8)."""
 
 
 def row_name(experiment: StaticExperiment) -> str:
@@ -44,12 +44,12 @@ class StaticResults:
     """Results of many experiments, by scene and by row of the tables.
 
     Args:
-        results: the results; when an experiment has several, the last one counts.
+        results: the results; if an experiment has several results, the last result counts.
 
     Attributes:
         all: all results.
         rows: names of the rows, the controls last.
-        by_scene: for each scene, the results of the rows.
+        by_scene: for each scene, the result of each row.
     """
 
     def __init__(self, results: Iterable[StaticResult]) -> None:
@@ -65,10 +65,10 @@ class StaticResults:
 
     @cached_property
     def answers(self) -> dict[Scene, str]:
-        """Whether each scene has a solution: the answer of the oracle; where it was not run, what is known otherwise.
+        """For each scene, whether a solution exists: "possible", "impossible" or "undecided", as the oracle answers.
 
-        A scene is also known to have a solution when its construction says so, or when a method kept the required
-        clearance.
+        If the oracle was not run, the construction of the scene gives the answer. If it does not, the answer is
+        "possible" if a method succeeded, and otherwise "undecided".
         """
         found = {}
         for scene, rows in self.by_scene.items():
@@ -84,7 +84,7 @@ class StaticResults:
         return found
 
     def contradictions(self) -> list[StaticResult]:
-        """Return the results that keep the required clearance although the oracle proved that no path does."""
+        """Return results that contradict the oracle: they keep the clearance, but it proved that no path can."""
         return [r for r in self.all if r.outcome == "success" and self.answers[r.experiment.scene] == IMPOSSIBLE]
 
     def families(self) -> list[tuple[str, int]]:
@@ -150,7 +150,7 @@ def place(family: tuple[str, int] | None) -> str:
 
 
 def scenes_table(results: StaticResults) -> Table:
-    """Return a table of the scenes, and how many of them have a solution."""
+    """Return a table of the number of scenes, and of the number of scenes that have a solution."""
     rows = []
     for family in [*results.families(), None]:
         scenes = [s for s in results.by_scene if results.usual(s) and family in (None, s[:2])]
@@ -168,13 +168,11 @@ def scenes_table(results: StaticResults) -> Table:
     checked = sum(ORACLE in rows_ for rows_ in results.by_scene.values())
     verdict = "No method keeps the clearance in a scene that the oracle proves impossible."
     if wrong:
-        verdict = (
-            f"The oracle is wrong: a method keeps the clearance where it proves that none can: {'; '.join(wrong)}."
-        )
+        verdict = f"The oracle is wrong. A method solves a scene that the oracle calls impossible: {'; '.join(wrong)}."
     note = (
-        f"The oracle was run in {checked} of {len(results.by_scene)} scenes; elsewhere, the construction of the scene "
-        "or a path that keeps the clearance decides. Only the scenes with a solution count in the rates of success. "
-        f"{verdict}"
+        f"The oracle was run in {checked} of {len(results.by_scene)} scenes; a scene without the oracle's answer "
+        "counts as possible if its construction or a path that keeps the clearance shows it. Only the scenes with a "
+        f"solution count in the rates of success. {verdict}"
     )
     columns = ("family", "scenes>", "possible>", "impossible>", "undecided>", "undecided, but solved by a method>")
     return Table("Scenes", columns, tuple(rows), note)
@@ -302,7 +300,7 @@ def checked_refusals_table(results: StaticResults, row: str = OURS) -> Table:
         "oracle, longest [s]>",
     )
     note = (
-        f"Every refusal of {row} was checked by the oracle. Right: the oracle proves that no path exists. Wrong: it "
+        f"The oracle checked every refusal of {row}. Right: the oracle proves that no path exists. Wrong: the oracle "
         "finds a path. An undecided refusal counts as not right. Times of the oracle: processor time of one scene. "
         f"Refusals that are not right: {'; '.join(doubtful) or 'none'}."
     )
@@ -350,10 +348,11 @@ def quality_table(results: StaticResults) -> Table:
         "torque RMS [N m]>",
     )
     note = (
-        "Means over the successes of each method, which differ: the paired comparison uses common scenes. RMSE: "
-        "distance from the learned path at equal fractions of the durations (thesis Eq 4.9, with the square root); "
-        f"unaffected: samples at which the tool is farther than {1e2 * NEAR:.0f} cm from every obstacle; of the path: "
-        "from the nearest point. Length and duration of the execution: relative to the learned path."
+        "Means over the successes of each method. Different methods succeed in different scenes; the paired "
+        "comparison uses common scenes. RMSE: distance from the learned path at equal fractions of the durations "
+        "(thesis Eq 4.9, with the square root); unaffected: RMSE over the samples at which the tool is farther than "
+        f"{1e2 * NEAR:.0f} cm from every obstacle; of the path: RMSE from the nearest point of the path. Length and "
+        "duration of the execution are divided by those of the learned path."
     )
     return Table("Quality of the successful paths", columns, tuple(rows), note)
 
@@ -391,9 +390,10 @@ def time_table(results: StaticResults) -> Table:
         "peak memory, median [kB]>",
     )
     note = (
-        "Time to plan one whole path, without construction. In each process, a method first plans once for each skill "
-        "without a clock, so that imports and what it computes once for a skill are not counted. Training of networks "
-        "and cost functions is not included either. Peak memory: what Python allocates in a separate run."
+        "Time to plan one whole path, without the construction of the policy. In each process, a method first plans "
+        "once for each skill without a clock. Imports and computations that are made once for a skill are therefore "
+        "not counted. Training of networks and cost functions is not counted either. Peak memory: the largest memory "
+        "that Python allocates in a separate run."
     )
     return Table("Computing time", columns, tuple(rows), note)
 

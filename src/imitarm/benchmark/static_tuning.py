@@ -1,7 +1,7 @@
 """Tuning of the static benchmark: the same random search for every method, on scenes that are not used for testing.
 
-Each option of a method's ``search_space`` is drawn log-uniformly. The best draw is the one with the highest rate of
-success on the validation scenes; among equals, the one with the smallest mean RMSE of its successes.
+Each option of a method's ``search_space`` is drawn log-uniformly. The best draw has the highest rate of success on the
+validation scenes. Among draws with the same rate, the best draw has the smallest mean RMSE of its successes.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Search:
     """A random search.
 
     Attributes:
-        scenes: scenes on which each draw is tried: family, dimension, seed.
+        scenes: scenes on which each draw is tried, each as family, dimension and seed.
         draws: number of draws for each method, the first of which has the default options.
         seed: seed of the draws.
 
@@ -51,7 +51,7 @@ class Search:
             raise InputError("tuning needs at least one scene and one draw")
 
     def options(self, method: str) -> list[Options]:
-        """Return the options of each draw of a method; only the default when its search space is empty."""
+        """Return the options of each draw of a method; if its search space is empty, there is only the default draw."""
         space = policy_class(method).search_space
         rng = np.random.default_rng([self.seed, *method.encode()])
         drawn: list[Options] = [()]
@@ -84,7 +84,7 @@ class Draw:
 
     @property
     def order(self) -> tuple[float, float]:
-        """Sort key; the best draw has the smallest."""
+        """Sort key of a draw; the best draw has the smallest key."""
         return -self.success, self.rmse if math.isfinite(self.rmse) else math.inf
 
 
@@ -107,9 +107,9 @@ def tune(
 
     Args:
         methods: names of the methods.
-        search: what is searched.
+        search: the scenes, the number of draws and the seed of the search.
         store: where the results are saved; an interrupted search continues where it stopped.
-        workers: processes that run the experiments.
+        workers: the processes that run the experiments.
         log: file in which each draw is a line of JSON.
         on_done: function called with the progress.
     """
@@ -129,7 +129,7 @@ def tune(
 
 
 def write_tuned(best: dict[str, Draw], search: Search, path: Path) -> None:
-    """Write the best options of each method, with the code and the configuration; other methods in the file stay."""
+    """Write the best options of each method, with code version and configuration; keep other methods in the file."""
     try:
         known = _read(path.read_text(encoding="utf-8"), str(path))["methods"] if path.exists() else {}
     except OSError as error:

@@ -31,7 +31,7 @@ class Table:
         return "\n".join([*lines, *(["", self.note] if self.note else []), ""])
 
     def for_page(self) -> dict[str, Any]:
-        """Return the table for a page template: text columns may wrap; headings that are symbols keep their case."""
+        """Return the table for a page template; ``kind`` tells whether a column holds words, numbers or a symbol."""
         columns = [
             {
                 "title": column.removesuffix(">"),
@@ -48,8 +48,8 @@ class Place:
 
     Attributes:
         document: path of the Markdown document.
-        benchmark: name of the benchmark. In the document, its tables stand between two comment lines: one that names
-            the benchmark (:attr:`begin`), and the line :data:`END`.
+        benchmark: name of the benchmark. In the document, the tables stand between two comment lines: :attr:`begin`,
+            which names the benchmark, and :data:`END`.
 
     Raises:
         InputError: when the document can't be read, or does not contain the two comment lines once each, in this order.
@@ -72,8 +72,7 @@ class Place:
         Args:
             found: the tables.
             command: the command that printed the tables.
-            versions: code version of each result. If a version differs from that of the running code, the document says
-                so.
+            versions: code version of each result. If the running code has another version, the document says so.
         """
         head, tail = self._parts()
         body = "\n".join(table.markdown() for table in found)

@@ -28,15 +28,15 @@ TROLLEY_SCALE = 0.5  # of lengths and of times: speeds stay as recorded, and acc
 
 @dataclass(frozen=True, eq=False)
 class RecordedMotion:
-    """Obstacles that move as recorded.
+    """Obstacles that move as they were recorded.
 
     Attributes:
         name: name of the recording.
         names: name of each obstacle.
-        times: shape (n,), every :data:`PERIOD` from 0 [s].
+        times: times of the samples, from 0 in steps of :data:`PERIOD`, shape (n,) [s].
         positions: centres of the obstacles, shape (n_obstacles, n, 3) [m].
-        velocities: their velocities, shape (n_obstacles, n, 3) [m/s].
-        scene: the same as a scene.
+        velocities: velocities of the obstacles' centres, shape (n_obstacles, n, 3) [m/s].
+        scene: the moving obstacles as a scene.
     """
 
     name: str

@@ -36,17 +36,17 @@ CAMERA = 1.5  # [m] distance of the camera from the middle of the motion
 
 @dataclass(frozen=True, eq=False)
 class TrackLog:
-    """What was known of one obstacle when each frame arrived; nan without a track.
+    """The truth and the tracker's estimate of one obstacle when each frame arrived; nan where it had no track.
 
     Attributes:
-        times: times of arrival, shape (n,) [s].
+        times: time at which each frame arrived, shape (n,) [s].
         truth: true positions at these times, shape (n, 3) [m].
         velocity: true velocities, shape (n, 3) [m/s].
         raw: last detected positions, shape (n, 3) [m].
-        filtered: positions estimated for the stamp of the frame, shape (n, 3) [m].
+        filtered: positions estimated for the time stamp of the frame, shape (n, 3) [m].
         predicted: positions predicted to the time of arrival, shape (n, 3) [m].
         estimated_velocity: velocities predicted to the time of arrival, shape (n, 3) [m/s].
-        nees: normalised estimation error squared at the stamp of the frame, shape (n,).
+        nees: normalised estimation error squared at the time stamp of the frame, shape (n,).
         ids: number of the track, shape (n,); -1 without a track.
     """
 
@@ -62,11 +62,11 @@ class TrackLog:
 
     @property
     def settled(self) -> NDArray[np.bool_]:
-        """Which frames count: with a track, and not in the first second, shape (n,)."""
+        """Which frames count: those after the first second in which the obstacle has a track, shape (n,)."""
         return (self.ids >= 0) & (self.times >= self.times[0] + _SETTLED)
 
     def lag(self, estimate: Array) -> float:
-        """Return the delay with which an estimate (n, 3) follows the truth [s]: the part of its error along ``-v``."""
+        """Return the delay of an estimate (n, 3) [s]: the component of its error against the velocity, per speed."""
         used = self.settled & np.isfinite(estimate).all(axis=1)
         error, v = (estimate - self.truth)[used], self.velocity[used]
         return float(-(error * v).sum() / (v * v).sum())
@@ -74,13 +74,13 @@ class TrackLog:
 
 @dataclass(frozen=True, eq=False)
 class Tracking:
-    """A recorded motion as one tracker followed it.
+    """How one tracker followed a recorded motion.
 
     Attributes:
         logs: one log for each obstacle.
         nis: mean normalised innovation squared of each frame with an assigned detection, shape (m,).
-        times: arrival of these frames, shape (m,) [s].
-        gate: largest possible normalised innovation squared.
+        times: time at which each of these frames arrived, shape (m,) [s].
+        gate: largest normalised innovation squared with which the tracker assigns a detection to a track.
         seconds: processor time of each update, shape (n,) [s].
     """
 
@@ -92,7 +92,7 @@ class Tracking:
 
     @property
     def expected_nis(self) -> float:
-        """Mean normalised innovation squared of a correct filter, given the gate."""
+        """Mean normalised innovation squared of a correct filter whose detections are limited by the gate."""
         return chi_square_moments(3, self.gate)[0]
 
     @property
@@ -102,7 +102,7 @@ class Tracking:
 
 
 def with_camera(detections: Iterable[Detection], motion: RecordedMotion) -> list[Detection]:
-    """Return detections as a camera in front of the middle of the motion measured them."""
+    """Return the detections of a simulated camera in front of the middle of the motion."""
     from imitarm.kinematics.pose import Pose  # noqa: PLC0415
 
     middle = motion.positions.reshape(-1, 3).mean(axis=0)
@@ -186,10 +186,10 @@ def _nearest(positions: Sequence[Array], truth: Array, last: Array) -> Array:
 
 
 def chosen_noise(motion: RecordedMotion, model: str, sensor: SensorModel = SENSOR) -> Noise:
-    """Return the process noise of the grid with which NIS and NEES are nearest to what a correct filter has.
+    """Return the process noise, from a grid, with which NIS and NEES are nearest to those of a correct filter.
 
-    Only the first half of the recording is used. The distance is the sum of the squared logarithms of both means over
-    their expected values.
+    Only the first half of the recording is used. The mean of NIS and the mean of NEES are each divided by the value of
+    a correct filter. The distance is the sum of the squared logarithms of the two quotients.
     """
 
     def distance(noise: Noise) -> float:
@@ -263,8 +263,8 @@ def tracking_tables(motions: Sequence[RecordedMotion], sensor: SensorModel = SEN
         accuracy += accuracy_rows(motion, found)
         consistency += consistency_rows(motion, found, noises)
     said = (
-        f"Noise {1e3 * sensor.noise:g} mm, {sensor.rate:g} Hz, latency {1e3 * sensor.latency:g} ms, dropout "
-        f"{100 * sensor.dropout:g} %. Errors against the true position when a frame arrives."
+        f"Noise {1e3 * sensor.noise:g} mm, {sensor.rate:g} Hz, latency {1e3 * sensor.latency:g} ms, "
+        f"dropout {100 * sensor.dropout:g} %. Errors are differences from the true position when a frame arrives."
     )
     return [
         Table(
@@ -294,8 +294,8 @@ def tracking_tables(motions: Sequence[RecordedMotion], sensor: SensorModel = SEN
                 "processor time of an update [µs]>",
             ),
             tuple(consistency),
-            "The process noise was chosen on the first half of each recording, by NIS and NEES. Expected: NIS 2.89 (3, "
-            "less the part beyond the gate), NEES 6. In brackets: block-bootstrap interval of the mean (95 %, blocks "
-            f"of {BLOCK:g} s).",
+            "The process noise was chosen on the first half of each recording, by NIS and NEES. Expected of a "
+            "correct filter: NEES 6 and NIS 2.89, which is below 3 because the gate removes large innovations. In "
+            f"brackets: block-bootstrap interval of the mean (95 %, blocks of {BLOCK:g} s).",
         ),
     ]

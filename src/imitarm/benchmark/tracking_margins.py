@@ -66,7 +66,7 @@ def random_motion(rng: np.random.Generator) -> Callable[[float], Array]:
 def synthetic_windows(n: int, stream: int, sensor: SensorModel = SENSOR, seed: int = 0) -> Array:
     """Return the errors of ``n`` predictions of independent motions, shape (n, n_times) [m].
 
-    Each obstacle is watched for 1 s; then its position is predicted from the last frame that has arrived.
+    The tracker observes each obstacle for 1 s; then its position is predicted from the last frame that has arrived.
 
     Args:
         n: number of windows.
@@ -115,11 +115,11 @@ def _batch(rng: np.random.Generator, sensor: SensorModel) -> list[Array]:
 
 
 def recorded_windows(motion: RecordedMotion, part: tuple[float, float], sensor: SensorModel = SENSOR) -> Windows:
-    """Return the errors of predictions every 0.1 s on a recorded motion; each window has the largest of all obstacles.
+    """Return the errors of predictions every 0.1 s on a recorded motion.
 
     Args:
         motion: the motion.
-        part: part of the recording, as fractions of its duration.
+        part: start and end of the part of the recording that is used, as fractions of its duration.
         sensor: the sensor.
     """
     begin, end = (fraction * motion.duration for fraction in part)
@@ -143,10 +143,10 @@ def recorded_windows(motion: RecordedMotion, part: tuple[float, float], sensor: 
 
 
 def margin_table(n: int, motions: Sequence[RecordedMotion] = (), sensor: SensorModel = SENSOR, seed: int = 0) -> Table:
-    """Return the table of coverage: windows that were not used for the calibration, synthetic and recorded.
+    """Return the table of coverage, measured on windows that were not used for the calibration.
 
     Args:
-        n: number of synthetic windows for testing; as many are used for calibration.
+        n: number of synthetic windows for testing; the same number is used for calibration.
         motions: recorded motions.
         sensor: the sensor.
         seed: seed of the random numbers.
@@ -172,9 +172,9 @@ def margin_table(n: int, motions: Sequence[RecordedMotion] = (), sensor: SensorM
         "Coverage of margins",
         ("tested on", "calibrated on", "offset [mm]>", "growth [mm/s]>", "windows within the margin [%]>"),
         tuple(rows),
-        f"Look-ahead 0 to {TIMES[-1]:g} s from the arrival of a frame; the margin must hold at all times of a window. "
-        f"Required: {100 * COVERAGE:g} %. In brackets: Wilson interval, or block-bootstrap interval (blocks of "
-        f"{BLOCK:g} s) on recorded motion.",
+        f"Look-ahead 0 to {TIMES[-1]:g} s from the arrival of a frame. A window is within the margin if its error is "
+        f"below the margin at all times of the window. Required: {100 * COVERAGE:g} %. In brackets: Wilson interval, "
+        f"or block-bootstrap interval (blocks of {BLOCK:g} s) on recorded motion.",
     )
 
 

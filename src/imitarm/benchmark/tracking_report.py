@@ -1,4 +1,4 @@
-"""The results of the tracking benchmark as one HTML page, with the form of thesis Fig 5.9."""
+"""The results of the tracking benchmark as one HTML page, with figures in the form of thesis Fig 5.9."""
 
 from __future__ import annotations
 
@@ -71,15 +71,17 @@ def tracking_report_html(
                 Figure(
                     position_chart(log, name),
                     f"Fig 5.9: position of the {name}",
-                    "(a) detections and estimate; (b) the same with the true position, as far as the detections reach.",
+                    "(a) detections and estimate; (b) detections, estimate and true position, on the axis range of "
+                    "the detections.",
                 )
             )
     figures.append(
         Figure(
             margin_chart(synthetic_windows(_WINDOWS, 0, sensor), synthetic_windows(_WINDOWS, 1, sensor)),
             "Errors of predictions and their margin",
-            f"Errors of {_WINDOWS} synthetic windows, and the margin calibrated with {_WINDOWS} others. Dashed: "
-            "95 % of the errors at each look-ahead time alone; the margin covers whole windows, so it is larger.",
+            f"Errors of {_WINDOWS} synthetic windows, and the margin calibrated with {_WINDOWS} others. Dashed: 95 % "
+            "of the errors at each look-ahead time alone; the margin must cover whole windows, so it is larger than "
+            "the dashed line.",
         )
     )
     verdict = (
@@ -114,7 +116,7 @@ def position_chart(log: TrackLog, name: str) -> str:
 
 
 def margin_chart(calibration: Array, test: Array) -> str:
-    """Draw prediction errors (n, n_times) [m] over the look-ahead time, with the margin from other windows."""
+    """Draw prediction errors (n, n_times) [m] over the look-ahead time, and the margin of other windows."""
     margin = CoverageMargin.calibrate(calibration, COVERAGE, times=TIMES)
     with canvas("margin", "Errors of predictions over the look-ahead time, and their margin", (5.5, 2.6)) as c:
         axes = c.axes(0.74, 0.78, 5.4, 2.5)

@@ -1,9 +1,9 @@
 """Train the network of the policy ``dmp-ann`` on paths of the expert: ``python -m imitarm.benchmark.train_ann``.
 
-The training scenes are those of the seeds for training, with one obstacle of any shape on the path of one of four
-skills. In the first round, the states are those of the expert's own paths. In each further round, the motions of the
-network add the states that they visit, with the coupling term of the expert's path that passes the obstacle on the
-nearest side (DAgger).
+The training scenes have the seeds that are reserved for training. Each has one obstacle of any shape on the path of one
+of four skills. In the first round, the network learns from the states along the expert's own paths. Each further round
+adds the states that the network's own motions visit (DAgger). For such a motion, the network learns the coupling term
+of the expert's path that is nearest to the motion.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class TrainingScene(NamedTuple):
 
     Attributes:
         policy: policy with the skill, the tool and the forbidden directions of the scene.
-        scene: one obstacle.
-        nominal: the learned path, 200 samples.
+        scene: the scene with its one obstacle.
+        nominal: the learned path, with 200 samples.
         deviations: for each expert path, a spline that gives its deviation from the learned path [m] as a function of
             the elapsed fraction of the duration. The paths pass the obstacle on different sides; the best is first.
     """
@@ -97,12 +97,13 @@ class Deviation:
 
 
 class Samples(NamedTuple):
-    """Samples to learn from: the network's inputs, its linear maps to the term, and the terms of the expert.
+    """Training samples. In each sample, a linear map takes the output of the network to a coupling term.
 
     Attributes:
-        features: shape (n, 10).
-        maps: shape (n, 3, 3), without the forbidden directions.
-        terms: C, shape (n, 3) [m].
+        features: inputs of the network, shape (n, 10).
+        maps: linear map from the network's output to the coupling term, shape (n, 3, 3); the map removes the forbidden
+            directions.
+        terms: coupling terms C of the expert, shape (n, 3) [m].
     """
 
     features: Array
@@ -114,7 +115,7 @@ class Samples(NamedTuple):
         return Samples(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
 
     def loss(self, network: MLP) -> float:
-        """Return the squared error of the term, divided by the squared term: 1 for a network that returns 0."""
+        """Return the sum of squared errors divided by the sum of squared terms; 1 for a network that returns 0."""
         error = np.einsum("nde,ne->nd", self.maps, network(self.features)) - self.terms
         return float(np.sum(error**2) / np.sum(self.terms**2))
 
@@ -164,9 +165,10 @@ def _positions(path: Trajectory) -> tuple[Array, Array]:
 
 
 def samples_of(scene: TrainingScene, states: Iterable[MotionState], deviation: Deviation) -> Samples:
-    """Return the samples for states of a motion, with the terms of one path of the expert at the same times.
+    """Return one sample for each state of a motion, with the term of a path of the expert at the same time.
 
-    The term is the same at a state beside the path, because the spring of the primitive pulls the motion to the path.
+    A state beside the path gets the same term as a state on it, because the spring of the motion primitive already
+    pulls the motion to the path.
     """
     stiffness, damping = scene.policy.skill.dmp_.gains_
     rows = []
@@ -225,7 +227,8 @@ class Training(NamedTuple):
 
     Attributes:
         network: the trained network.
-        losses: loss on the expert's states of the training scenes before the training and after each round.
+        losses: loss on the expert's states in the training scenes; the first value is before the training, and each
+            further value is after a round.
         validation_loss: loss on the expert's states of the validation scenes.
         kept: fraction of the validation scenes in which the motion keeps the clearance, for each of ``GAINS``.
         seconds: duration of the training, without the validation [s].
@@ -239,12 +242,12 @@ class Training(NamedTuple):
 
     @property
     def gain(self) -> float:
-        """The gain that keeps the clearance in most validation scenes; among equals, the smallest."""
+        """The gain that keeps the clearance in most validation scenes; among equally good gains, the smallest."""
         return GAINS[int(np.argmax(self.kept))]
 
 
 def validation_samples(n_scenes: int) -> Samples:
-    """Return the samples along the expert's paths of the first validation scenes."""
+    """Return the samples along the expert's paths in the first ``n_scenes`` validation scenes."""
     nothing = MLP.random((N_FEATURES, *LAYERS, N_OUTPUTS), np.random.default_rng(0))
     return _expert_samples(_scenes(n_scenes, nothing, "validation"))
 

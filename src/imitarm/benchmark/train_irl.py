@@ -1,22 +1,26 @@
 r"""Learn the weights of the baseline ``gmm-irl``: ``python -m imitarm.benchmark.train_irl --output weights.json``.
 
-The demonstrations are the best paths of the expert (:mod:`imitarm.policies.baselines.expert`) around one obstacle, half
-of them in a plane and half in space, in scenes with the seeds of training. The result depends only on the arguments.
+The demonstrations are the best paths of the expert (:mod:`imitarm.policies.baselines.expert`) around one obstacle. Half
+of the scenes are planar, half are spatial, and all have seeds that are reserved for training. The result depends only
+on the arguments of the command.
 
 Inverse reinforcement learning finds the weights of the path cost under which the demonstrated paths are most likely.
 The maximum-entropy model gives a path ``X`` the probability ``p(X) = exp(-J_w(X)) / Z_w`` (Ziebart et al. 2008). The
 integral ``Z_w`` is replaced by Laplace's approximation at the local minimum ``X*`` that belongs to the demonstration
-``X_d`` (Levine and Koltun 2012 use the same approximation at ``X_d``). Up to a constant, the log-likelihood is::
+``X_d`` (Levine and Koltun 2012 use the same approximation at ``X_d``). Up to a constant, the log-likelihood of the
+weights ``w`` is::
 
     L(w) = sum_d [J_w(X*) - J_w(X_d) + 1/2 log det H_w(X*)],     H_w = Hessian of J_w
 
-and its derivative, with ``H_k`` the Hessian of feature ``k``, matches features::
+Its derivative is the difference between expected and demonstrated features. With ``H_k`` for the Hessian of feature
+``phi_k``::
 
     dL/dw_k = sum_d [E phi_k - phi_k(X_d)],     E phi_k = phi_k(X*) + 1/2 tr(H_w^-1 H_k)
 
-The weights stay positive, because their logarithms are learned, by Fisher scoring: the covariance of the features is
-the second derivative of ``L``, and ``Cov(phi_k, phi_l) = grad phi_k^T H^-1 grad phi_l + 1/2 tr(H^-1 H_k H^-1 H_l)``. A
-normal prior on the logarithms keeps those weights finite on which the demonstrations have no influence.
+The weights stay positive, because their logarithms are learned. The method is Fisher scoring, which uses the covariance
+of the features as the second derivative of ``L``: ``Cov(phi_k, phi_l) = grad phi_k^T H^-1 grad phi_l + 1/2 tr(H^-1 H_k
+H^-1 H_l)``. A normal prior on the logarithms keeps every weight finite, even a weight on which the demonstrations have
+no influence.
 """
 
 from __future__ import annotations
@@ -53,10 +57,10 @@ _SHIFTS = (0.0, *np.logspace(-10, 0, 11))  # of an indefinite Hessian, relative 
 
 
 class Expectation(NamedTuple):
-    """Moments of the features in one scene.
+    """Mean and covariance of the path's features in one scene, under the maximum-entropy model.
 
     Attributes:
-        minimum: the deviation of the local minimum, shape (94, k) [m].
+        minimum: deviation from the learned path at which the cost has a local minimum, shape (94, k) [m].
         mean: expected features, shape (m,).
         covariance: covariance of the features, shape (m, m).
     """
@@ -97,7 +101,7 @@ def inverse_hessian(cost: PathCost, weights: Array, blocks: Array) -> Array:
 
 
 def expectation(cost: PathCost, weights: Array, start: Array) -> Expectation:
-    """Return Laplace's approximation of the features' moments at the local minimum reached from ``start`` (94, k)."""
+    """Search a minimum of the cost from ``start`` (94, k) [m]; return Laplace's mean and covariance of the features."""
     minimum = cost.minimised(weights, start)
     blocks = cost.blocks(minimum)
     inverse = inverse_hessian(cost, weights, blocks)
@@ -125,7 +129,7 @@ def _times_smoothness(matrix: Array, smoothness: Array, k: int) -> Array:
 
 
 def first_weights(costs: Sequence[PathCost], demonstrated: Array) -> Array:
-    """Return weights with which all features contribute equally to a cost of half the number of free coordinates."""
+    """Return weights that make all features' costs equal; their sum is half the number of free coordinates."""
     freedom = np.mean([cost.precisions.shape[0] * cost.precisions.shape[1] for cost in costs])
     part = 0.5 * float(freedom) / len(FEATURES)
     return np.asarray(part / np.where(demonstrated > 1e-6, demonstrated, part))
@@ -142,9 +146,10 @@ def learn_weights(
     """Learn the weights of the features.
 
     Args:
-        costs: one for each demonstration.
-        demonstrations: deviations, each of shape (94, k) [m].
-        prior: standard deviation of the logarithm of each weight about its first value.
+        costs: path cost of the scene of each demonstration.
+        demonstrations: deviation of each demonstration from the learned path, each of shape (94, k) [m].
+        prior: standard deviation of the normal prior on the logarithm of each weight; its mean is the logarithm of the
+            first weight.
         iterations: largest number of iterations.
         on_iteration: function called with the number of the iteration and the weights.
     """
@@ -174,7 +179,7 @@ def demonstrations(n_scenes: int, first_seed: int = 0) -> Iterator[tuple[PathCos
     """Yield the path cost of each training scene, and the expert's deviation from the learned path.
 
     Args:
-        n_scenes: number of scenes; every second one is planar.
+        n_scenes: number of scenes; every second scene is planar.
         first_seed: seed of the first two scenes.
     """
     skills = {planar: learn(planar=planar) for planar in (True, False)}

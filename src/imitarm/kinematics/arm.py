@@ -75,8 +75,9 @@ class ArmModel(ArmKinematics):
     .. math:: M(q) \ddot q + C(q, \dot q) \dot q + g(q) = \tau
 
     Here, :math:`M` is the rigid-body inertia, :math:`C` contains the Coriolis and centrifugal terms, :math:`g` is
-    gravity and :math:`\tau` are the joint torques. Rotor inertia (``armature``), viscous damping and dry friction of
-    the joints, which a simulated arm also has, are not included; their values are in ``spec()``.
+    gravity and :math:`\tau` are the joint torques. The equation leaves out the rotor inertia (``armature``), the
+    viscous damping and the dry friction of the joints. A simulated arm includes these effects; their values are in
+    ``spec()``.
 
     All poses are in the base frame, whose origin is the origin of the robot's file. In Jacobians, the three rows of the
     linear velocity come before the three rows of the angular velocity. All methods take one posture ``q`` of shape
@@ -95,8 +96,8 @@ class ArmModel(ArmKinematics):
         tool_to_flange: pose of the tool's tip in the flange frame; the identity without a tool.
         tool_radius: radius of the cylinder about the tool's axis that contains the tool's head [m]; 0 without a tool.
         sphere_bodies: name of the body of each sphere of :meth:`collision_spheres`.
-        cover: the spheres of :meth:`collision_spheres`.
-        chain: kinematics and dynamics of many postures at once.
+        cover: radii and links of the spheres of :meth:`collision_spheres`.
+        chain: kinematics and dynamics of the arm for arrays of postures.
         landmarks: shoulder, elbow and wrist, from sites of these names in the file; None if the file has none.
         notes: assumptions about values that the file does not define, and joints that are not part of the arm.
     """
@@ -128,8 +129,9 @@ class ArmModel(ArmKinematics):
 
         Limits come from the file. For limits that the file does not define, the model assumes 2 rad/s and 10 rad/s^2
         for hinges, 0.2 m/s and 1 m/s^2 for slides, and unlimited torque; ``notes`` lists these assumptions. MJCF has no
-        standard element for speed and acceleration limits, so write them as ``<custom><numeric name="max_velocity"
-        data="..."/></custom>`` (and ``max_acceleration``), one value for each joint.
+        standard element for speed and acceleration limits. Write speed limits as ``<custom><numeric name="max_velocity"
+        data="..."/></custom>``, with one value for each joint, and acceleration limits as ``max_acceleration`` in the
+        same way.
 
         The posture ``home`` comes from the file's keyframe ``home``, or else from its first keyframe. If the file has
         no keyframe, ``home`` is the middle of the joints' ranges, provided that this posture is not singular and keeps
@@ -139,10 +141,10 @@ class ArmModel(ArmKinematics):
         Args:
             name_or_path: ``"sawyer"``, ``"panda"`` or a path.
             tool: ``"gripper"``, ``"brush"``, the path of an MJCF file with a site ``tool`` at its tip, or None.
-            flange: name of the body or site that is the flange; None: a site named ``flange``, else the end of the only
-                arm in the file, before jaws and fingers.
+            flange: name of the body or site that is the flange. If None, the flange is the site named ``flange``;
+                without such a site, the flange is the last link of the arm before jaws and fingers.
             package_path: one or more folders to search for meshes and ROS packages.
-            discard_meshes: whether to leave out all meshes. Contact and :meth:`collision_spheres` then use only
+            discard_meshes: whether to leave out all meshes. If True, contact and :meth:`collision_spheres` use only
                 primitive shapes.
 
         Raises:
@@ -213,10 +215,11 @@ class ArmModel(ArmKinematics):
         """Return a new MuJoCo spec of the arm and its tool, from which to build a world; the base is at the origin.
 
         Names are taken from the file; names of the tool begin with ``"tool/"``, except the site ``"tool"`` at its tip.
-        The flange is the site ``"flange"``. Geoms of group 3 are used for contact, all others only for drawing; a file
-        without this separation is converted. The arm's joints have no actuators, so a world must add the actuators that
-        it needs. Each joint has its torque limit as ``actuatorfrcrange``. A gripper has one actuator,
-        ``"tool/opening"``, a position servo of its opening [m]. There are no keyframes: use :meth:`posture`.
+        The flange is the site ``"flange"``. Geoms of group 3 are used for contact, and all other geoms only for
+        drawing. If a file does not separate its geoms in this way, they are converted. The arm's joints have no
+        actuators, so a world must add the actuators that it needs. Each joint has its torque limit as
+        ``actuatorfrcrange``. A gripper has one actuator, ``"tool/opening"``, a position servo of its opening [m]. The
+        spec has no keyframes; :meth:`posture` gives the joint positions of a posture.
         """
         return self._spec.copy()
 
@@ -257,9 +260,9 @@ class ArmModel(ArmKinematics):
         return self.sphere_centers(q).copy(), self.cover.radii
 
     def sphere_centers(self, q: ArrayLike) -> Array:
-        """Return the centers of :meth:`collision_spheres`, shape (m, 3) [m]; computed once for each posture.
+        """Return the centers of :meth:`collision_spheres`, shape (m, 3) [m]; they are computed once for each posture.
 
-        The array must not be changed, and is valid until a method is called with another posture.
+        Do not change the array. It is valid until a method is called with another posture.
         """
         memory = self.at(q)
         if memory.centers is None:
@@ -268,7 +271,7 @@ class ArmModel(ArmKinematics):
 
     @property
     def tool_spheres(self) -> Array:
-        """Spheres that cover everything that moves rigidly with the tool: last link, hand and fingers.
+        """Spheres that cover every part that moves rigidly with the tool: the last link, the hand and the fingers.
 
         Each row is x, y, z and radius in the tool's frame, shape (m, 4) [m]. A policy keeps the required clearance for
         these spheres.

@@ -58,7 +58,8 @@ class ArmFile:
         home: position of every joint by name, including the joints of the tool.
         tool_radius: radius of the cylinder about the tool's axis that holds the tool's head [m]; 0 without a tool.
         notes: assumptions about values that the file does not define, and joints that were left out.
-        mass_faults: links whose mass or inertia can't be used, so that no torque can be computed.
+        mass_faults: texts that name the links with an unusable mass or inertia; with such a link, torques can't be
+            computed.
     """
 
     name: str
@@ -94,7 +95,8 @@ def read_arm(
     Args:
         source: ``"sawyer"``, ``"panda"`` or the path of an MJCF or URDF file.
         tool: ``"gripper"``, ``"brush"``, the path of an MJCF file with a site ``tool``, or None.
-        flange: body or site that is the flange; None: a site ``flange``, or the end of the only arm in the file.
+        flange: body or site that is the flange; None: the site ``flange``, or the last link of the only arm in the
+            file.
         discard_meshes: whether to read the file without its meshes.
         package_path: folders to search for meshes and ROS packages.
 

@@ -27,7 +27,7 @@ def usable_posture(
 ) -> tuple[Array, tuple[str, ...]]:
     """Return a usable home posture and notes for the user.
 
-    The posture is the middle of the joints' ranges if that is usable, otherwise the best of many postures.
+    The posture is the middle of the joints' ranges if this posture is usable, otherwise the best of many postures.
 
     Args:
         model: a compiled model with a site ``flange``.

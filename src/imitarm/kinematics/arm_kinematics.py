@@ -71,10 +71,10 @@ class Landmarks:
 
 
 class ArmMemory:
-    """MuJoCo's working memory for one arm in one thread, and the posture for which its kinematics are valid.
+    """MuJoCo's working memory for one arm in one thread, and the posture for which the memory holds the kinematics.
 
     Attributes:
-        data: the kinematics of the posture.
+        data: MuJoCo's data, with the kinematics of the posture.
         jacobian: Jacobian of the last requested site, shape (6, nv), linear rows first.
         linear: first three rows of ``jacobian``.
         angular: last three rows of ``jacobian``.
@@ -191,8 +191,8 @@ class ArmKinematics:
     def at(self, q: ArrayLike) -> ArmMemory:
         """Return this thread's working memory with the kinematics at ``q``.
 
-        Use it in loops that need several results for one posture. The kinematics are recomputed only for a new posture,
-        and are valid until a method is called with another posture.
+        Use this memory in loops that need several results for one posture. The kinematics are computed again only for a
+        new posture. They are valid until a method is called with another posture.
         """
         # The usual case is decided here: it is on the path of every control step.
         usual = type(q) is np.ndarray and q.dtype is _FLOAT64 and q.shape == self._shape

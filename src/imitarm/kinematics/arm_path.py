@@ -90,26 +90,26 @@ class ArmPath:
         return jacobians
 
     def speeds(self, velocity: Array) -> Array:
-        """Return an upper bound of the speeds of a link's spheres, relative to each earlier link of the arm.
+        """Return upper bounds of the speeds of each link's spheres, relative to the frame of each earlier link.
 
         Args:
             velocity: joint velocities, shape (n, n_joints) [rad/s].
 
         Returns:
-            Shape (n, n_joints, n_joints) [m/s]; first the index of the link, which is that of the last joint that moves
-            it, then the number of joints that move the frame.
+            Bounds, shape (n, n_joints, n_joints) [m/s]. The second axis is the index of the link, which is the index of
+            the last joint that moves the link. The third axis is the number of joints between the base and the frame.
         """
         parts = self._reaches * np.abs(velocity)[:, None]
         return np.asarray(np.cumsum(parts[..., ::-1], axis=2)[..., ::-1])
 
     @cached_property
     def travel(self) -> Array:
-        """Bounds of the way of all spheres of each link from one posture to the next one.
+        """Upper bounds of the path length of each link's spheres from one posture to the next.
 
-        The joints move linearly. Meanwhile a sphere may be farther from an axis than in both postures, by at most half
-        of its path due to the joints between them.
+        The joints move linearly. Between the two postures, a sphere may be farther from a joint's axis than in either
+        posture. The additional distance is at most half of the path that the joints between axis and sphere cause.
 
-        The shape is (n - 1, n_joints, n_joints) [m]; see :meth:`speeds`.
+        The shape is (n - 1, n_joints, n_joints) [m]; the axes mean what they mean in :meth:`speeds`.
         """
         steps = np.abs(np.diff(self.joints, axis=0))
         travel = np.maximum(self._reaches[:-1], self._reaches[1:])
@@ -125,7 +125,7 @@ class ArmPath:
         return self.arm.chain.reaches(self.placed)
 
     def sphere_speeds(self, sample: Index, sphere: Index, directions: Array) -> Array:
-        """Return each sphere's speed along its direction per unit speed of each joint, shape (k, n_joints) [m/rad].
+        """Return the speed of each sphere along its direction, per unit of each joint's speed, (k, n_joints) [m/rad].
 
         Args:
             sample: index of the posture, shape (k,).
@@ -162,8 +162,8 @@ class ArmPath:
         """Return the displacement and the rotation vector from the tool to each given pose, shape (n, 6) [m, rad].
 
         Args:
-            positions: shape (n, 3) [m].
-            quaternions: tool_to_base, shape (n, 4).
+            positions: positions of the tool's tip, shape (n, 3) [m].
+            quaternions: rotations tool_to_base, wxyz, shape (n, 4).
         """
         rotation = quaternion_log(quaternion_multiply(quaternions, quaternion_conjugate(self.quaternions)))
         return np.concatenate([positions - self.positions, rotation], axis=1)
@@ -172,8 +172,8 @@ class ArmPath:
         """Move the joints of all postures so that the tool reaches given poses, with the least joint motion (Newton).
 
         Args:
-            positions: shape (n, 3) [m].
-            quaternions: tool_to_base, shape (n, 4).
+            positions: positions of the tool's tip, shape (n, 3) [m].
+            quaternions: rotations tool_to_base, wxyz, shape (n, 4).
 
         Returns:
             The moved path, and the largest remaining error over all coordinates of all poses [m, rad].
@@ -231,14 +231,15 @@ def track(arm: ArmModel, start: Array, positions: Array, quaternions: Array, dri
     Args:
         arm: the arm with its tool.
         start: posture before the first pose, shape (n_joints,) [rad].
-        positions: shape (n, 3) [m].
-        quaternions: tool_to_base, shape (n, 4).
+        positions: positions of the tool's tip, shape (n, 3) [m].
+        quaternions: rotations tool_to_base, wxyz, shape (n, 4).
         drift: posture that the arm gradually approaches until the last pose, by joint motions that do not move the
             tool (self-motion), shape (n_joints,) [rad]; None: there is no self-motion.
 
     Returns:
-        Shape (n, n_joints) [rad]. The tool is within 0.1 mm and 0.1 mrad of its poses; :meth:`ArmPath.moved_to` moves
-        it there exactly. If a pose is out of reach, its posture is the nearest one that was found.
+        Joint positions, shape (n, n_joints) [rad]. They bring the tool to within 0.1 mm and 0.1 mrad of each pose;
+        :meth:`ArmPath.moved_to` removes the remaining error. If a pose is out of reach, the result is the posture that
+        was found nearest to the pose.
     """
     site = arm.site("tool")
     joints, q = np.empty((len(positions), arm.n_joints)), np.array(start, dtype=float)

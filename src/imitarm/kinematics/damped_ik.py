@@ -80,7 +80,7 @@ def _undamped(problem: IKProblem, gram: Array) -> Array:
 
 
 def filtered_svd(problem: IKProblem) -> Array:
-    """Damp only the directions near a singularity (Maciejewski and Klein 1988)."""
+    """Damp only the directions with small singular values (Maciejewski and Klein 1988)."""
     jacobian, target, _ = problem.tasks[0]
     squares, basis, _ = lapack.dsyev(jacobian.dot(jacobian.T))
     squares = np.maximum(squares, 0.0)

@@ -1,7 +1,7 @@
 r"""Inverse kinematics, one control step at a time: from tasks and limits to the velocity of the joints.
 
-:func:`solve_ik` combines :mod:`tasks <imitarm.kinematics.tasks>` (what the joints should do) with
-:mod:`limits <imitarm.kinematics.limits>` (what they must not exceed). :class:`IKSolver` does the same in a loop.
+:func:`solve_ik` combines :mod:`tasks <imitarm.kinematics.tasks>` (what the joints should do) with :mod:`limits
+<imitarm.kinematics.limits>` (what they must not exceed). For a control loop, use :class:`IKSolver`.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class IKStep:
     Attributes:
         velocity: velocity of the joints, shape (n_joints,) [rad/s].
         missing: target velocity minus achieved velocity of each task, in the weighted units of the task.
-        limited: whether each joint velocity is at a bound of the box, shape (n_joints,) bool.
+        limited: whether each joint velocity is at a bound of the box, boolean array, shape (n_joints,).
         slack: violation of each row (inequality on the joint velocity), shape (m,); 0 where the row is satisfied.
     """
 
@@ -54,7 +54,7 @@ class IKStep:
 
 
 class IKSolver:
-    r"""Inverse kinematics of one arm for a control loop; arguments that do not change are checked once.
+    r"""Inverse kinematics of one arm for a control loop; arguments that stay the same are checked only once.
 
     The method ``"qp"`` minimises the following cost over the joint velocity v inside every
     :class:`~imitarm.kinematics.limits.Box`:
@@ -65,17 +65,18 @@ class IKSolver:
     Here, each task has a Jacobian :math:`J_i` and a target :math:`t_i`, and :math:`v_p` is the joint velocity of the
     previous step. The rows :math:`A_j v \ge b_j` have the prices (penalty weights) :math:`c_j`. Rows without a finite
     price are hard constraints, which are kept whenever the boxes allow it. If the boxes contradict these constraints,
-    the sum of the squared violations of the constraints, in rad/s along each row, is minimised first, and the tasks
-    have second priority. The other methods accept one :class:`~imitarm.kinematics.tasks.TwistTask`, optionally one
-    :class:`~imitarm.kinematics.tasks.PostureTask`, and no limits except boxes. These methods are the following:
+    the solver first minimises the sum of the squared violations. A violation is measured in rad/s along its row. The
+    tasks then have second priority. The methods ``"dls"``, ``"dls_small_angle"`` and ``"svd"`` accept one
+    :class:`~imitarm.kinematics.tasks.TwistTask` and optionally one :class:`~imitarm.kinematics.tasks.PostureTask`.
+    These methods accept no limits except boxes:
 
     * ``"dls"``, damped least squares (thesis Eq 3.8 and 3.9), computes :math:`v = J^T (J J^T+\lambda^2)^{-1} t` with
       each joint's velocity measured in units of its limit. Let :math:`s_{min}` be the smallest singular value of J, and
       :math:`d=|t|`. There is no damping (:math:`\lambda=0`) if :math:`s_{min}\ge d`. The damping is
       :math:`\lambda^2=s_{min}(d-s_{min})` if :math:`d/2\le s_{min}<d`, and :math:`\lambda=d/2` if :math:`s_{min}` is
       smaller. This damping keeps the norm of the scaled velocity at most 1.
-    * ``"dls_small_angle"`` is ``"dls"`` with half of the smallest singular value subtracted from d, as the thesis
-      prints after Eq 3.9. The subtraction weakens the damping; the method is kept for comparison.
+    * ``"dls_small_angle"`` is like ``"dls"``, but d is reduced by half of the smallest singular value, as the thesis
+      prints after Eq 3.9. The smaller d weakens the damping; the method is kept for comparison.
     * ``"svd"``, numerical filtering (Maciejewski and Klein 1988), damps only the directions whose singular value
       :math:`s_i` is below 0.06. With the singular vectors :math:`u_i` and :math:`v_i`, the velocity is :math:`v=\sum_i
       s_i/(s_i^2+\lambda_i^2)\, v_i u_i^T t`. The damping is :math:`\lambda_i^2=0.06^2(1-(s_i/0.06)^2)` if
@@ -124,7 +125,7 @@ class IKSolver:
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
-            tasks: one or more tasks; the first one must be for the tool.
+            tasks: one or more tasks; the first task must be for the tool.
             velocity: joint velocity of the previous step, shape (n_joints,) [rad/s]; needed for the acceleration
                 limits.
             rows: additional inequalities in this step, only for ``"qp"``.
@@ -159,7 +160,7 @@ class IKSolver:
         velocity: ArrayLike | None = None,
         rows: Rows | Sequence[Rows] | None = None,
     ) -> IKProblem:
-        """Return the problem that the methods solve; same arguments and errors as :meth:`solve`."""
+        """Return the problem that the methods solve; arguments and errors are those of :meth:`solve`."""
         arm = self.arm
         memory = arm.at(q)
         position = q if type(q) is np.ndarray and q.dtype is _FLOAT64 else np.asarray(q, dtype=float)
@@ -257,13 +258,13 @@ def solve_ik(
 ) -> Array:
     """Return the joint velocity that fulfils the tasks as far as the limits allow.
 
-    ``solve_ik(arm, q, TwistTask([0.1, 0, 0, 0, 0, 0]))`` moves the tool at 0.1 m/s along x. :class:`IKSolver`
-    explains the methods, and does the same in a loop.
+    ``solve_ik(arm, q, TwistTask([0.1, 0, 0, 0, 0, 0]))`` moves the tool at 0.1 m/s along x. :class:`IKSolver` explains
+    the methods. Use :class:`IKSolver` itself in a control loop.
 
     Args:
         arm: the arm.
         q: joint positions, shape (n_joints,) [rad].
-        tasks: one or more tasks; the first one must be for the tool.
+        tasks: one or more tasks; the first task must be for the tool.
         limits: limits to keep; None: position, velocity and acceleration limits of the joints.
         dt: length of the control step [s].
         method: ``"qp"``, ``"dls"``, ``"dls_small_angle"`` or ``"svd"``.

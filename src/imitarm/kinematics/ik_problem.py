@@ -30,15 +30,16 @@ class Box(NamedTuple):
 class Rows(NamedTuple):
     """Linear inequalities on the joint velocity, ``matrix @ v >= lower``.
 
-    With a finite price, violating a row ``a`` by ``s`` adds ``price * (s / |a|)^2 / 2`` to the cost; the weights of the
-    tasks are about 1. Because of the division by ``|a|``, the cost does not depend on the unit of the row: ``s / |a|``
-    is the smallest change of the joint velocity [rad/s] that would satisfy the row. Without a finite price, rows have
-    priority over all tasks: they are violated only if they contradict one another or the bounds in :class:`Box`.
+    Let ``a`` be a row of the matrix, and ``s`` the amount by which the velocity violates its inequality. If the price
+    is finite, the violation adds ``price * (s / |a|)^2 / 2`` to the cost, in which the tasks have weights of about 1.
+    The quotient ``s / |a|`` is the smallest change of the joint velocity [rad/s] that would satisfy the row, so the
+    cost does not depend on the unit of the row. If the price is infinite, the rows have priority over all tasks. Such
+    rows are violated only if they contradict one another or the bounds in :class:`Box`.
 
     Attributes:
         matrix: coefficients of the inequalities, shape (m, n_joints).
         lower: lower bounds, shape (m,).
-        price: penalty weight of a violation.
+        price: penalty weight of a violation; inf for hard constraints.
     """
 
     matrix: Array
@@ -53,13 +54,13 @@ def violable(matrix: Array, lower: Array, box: Box) -> NDArray[np.bool_]:
 
 
 class TaskRows(NamedTuple):
-    """The rows of a task at one step: ``jacobian @ v`` should equal ``target``; both are already weighted.
+    """The weighted equations of a task in one control step: ``jacobian @ v`` should equal ``target``.
 
     Attributes:
-        jacobian: Jacobian of the task, shape (m, n_joints).
-        target: target velocity of the task, shape (m,).
-        effort: factor by which the small cost of joint motion is multiplied: 1 for a task with full weights, less for a
-            task with small weights.
+        jacobian: weighted Jacobian of the task, shape (m, n_joints).
+        target: weighted target velocity of the task, shape (m,).
+        effort: factor of the small cost of joint motion: 1 for a task with full weights, less for a task with small
+            weights.
     """
 
     jacobian: Array
@@ -78,13 +79,14 @@ class IKProblem:
         velocity: joint velocity of the previous step, shape (n_joints,) [rad/s]; None: unknown, so accelerations are
             not limited.
         dt: length of the control step [s].
-        box: hard bounds of the joint velocity: at first the arm's velocity limits, which each limit of the solver may
-            then narrow.
+        box: hard bounds of the joint velocity. They begin as the arm's velocity limits; each limit of the solver may
+            narrow them.
         tasks: rows of the tasks; the tool's rows come first.
         rows: soft inequalities.
         max_speed: largest norm of a twist, for tasks without their own limit [m/s].
         scaled: whether each joint velocity is counted in units of its velocity limit, as in damped least squares.
-        posture: drift in the null space, shape (n_joints,) [rad/s], for the damped methods; None: no drift.
+        posture: desired joint velocity in the null space of the tool's task, shape (n_joints,) [rad/s], for the damped
+            methods; None: no such velocity.
     """
 
     arm: ArmModel

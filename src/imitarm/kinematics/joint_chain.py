@@ -1,15 +1,15 @@
 r"""Kinematics and dynamics of a chain of joints in many postures at once, as arrays.
 
-The joint j turns everything behind it about its axis. In the reference posture, this axis is the unit vector
-:math:`a_j` through the point :math:`o_j`. In another posture, a point c of a link that is moved by the first k joints
-has moved to
+Joint j rotates all links after it, towards the tool, about its axis. In the reference posture, this axis has the
+direction of the unit vector :math:`a_j` and passes through the point :math:`o_j`. Let c be a point of a link that the
+first k joints move. In another posture, the point is at
 
 .. math:: T_k\, c, \qquad T_k = E_1(\theta_1) \cdots E_k(\theta_k), \qquad
           E_j(\theta)\, x = o_j + \exp(\theta\,[a_j]_\times)(x - o_j)
 
-where :math:`\theta_j` is the difference of the joint position from the reference posture (product of exponentials). A
-prismatic joint adds :math:`\theta a_j` instead. The torques follow from the recursive Newton-Euler algorithm, with all
-spatial vectors about the origin of the base frame.
+where :math:`\theta_j` is the joint position minus its value in the reference posture (product of exponentials). For a
+prismatic joint, :math:`E_j(\theta)\,x = x + \theta a_j`. The torques follow from the recursive Newton-Euler algorithm,
+with all spatial vectors about the origin of the base frame.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ class Placed(NamedTuple):
     Attributes:
         axes: unit vectors along the axes of the joints in the base frame, shape (n, n_joints, 3).
         anchors: a point on the axis of each joint in the base frame, shape (n, n_joints, 3) [m].
-        rotations: rotation from the reference posture of the base, and then of what each joint moves, shape
-            (n, n_joints + 1, 3, 3).
-        shifts: what is added after the rotation, shape (n, n_joints + 1, 3) [m].
+        rotations: rotation matrix of the base and of the link that each joint moves, relative to the reference posture,
+            shape (n, n_joints + 1, 3, 3).
+        shifts: displacement of the base and of each link, added after the rotation, shape (n, n_joints + 1, 3) [m].
     """
 
     axes: Array
@@ -54,8 +54,8 @@ class JointChain:
 
     Attributes:
         slides: True for prismatic joints, shape (n_joints,).
-        middles: a point amid the spheres of each link in the reference posture, shape (n_joints, 3) [m].
-        extents: largest distance of the centre of a sphere of each link from this point, shape (n_joints,) [m].
+        middles: for each link, a point in the middle of its spheres in the reference posture, shape (n_joints, 3) [m].
+        extents: for each link, the largest distance from this point to the centre of a sphere, shape (n_joints,) [m].
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class JointChain:
         self._gravity = np.array(model.opt.gravity)
 
     def placed(self, joints: Array) -> Placed:
-        """Compute where the joints and links are.
+        """Compute the positions and rotations of the joints and links in many postures.
 
         Args:
             joints: joint positions, shape (n, n_joints) [rad].
@@ -140,12 +140,12 @@ class JointChain:
         return out
 
     def reaches(self, placed: Placed) -> Array:
-        """Return a bound of the distance of every link's spheres from the axis of each joint that moves the link.
+        """Return bounds of the distance from the axis of each joint to the spheres of each link that it moves.
 
         Returns:
-            Shape (n, n_joints, n_joints) [m], with the link first: the link k is moved by the joints 0 to k. The
-            value is 1 for a prismatic joint, which moves every point by the same amount, and 0 for a joint that does
-            not move the link.
+            Bounds, shape (n, n_joints, n_joints) [m]; the second axis is the link, the third the joint. The joints 0 to
+            k move the link k. The value is 1 for a prismatic joint, which moves every point by the same amount, and 0
+            for a joint that does not move the link.
         """
         middles = (placed.rotations[:, 1:] @ self.middles[:, :, None])[..., 0] + placed.shifts[:, 1:]
         away = middles[:, :, None] - placed.anchors[:, None]
@@ -154,7 +154,7 @@ class JointChain:
         return np.tril(reaches)
 
     def torques(self, placed: Placed, velocity: Array, acceleration: Array) -> Array:
-        """Return the torques of motions, with the weight of the links, shape (..., n, n_joints) [N m].
+        """Return the joint torques of motions, including gravity, shape (..., n, n_joints) [N m].
 
         Args:
             placed: the chain in n postures.

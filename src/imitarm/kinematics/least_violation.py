@@ -17,10 +17,10 @@ _FREE = 1e30
 def least_violation(box: Box, matrix: Array, least: Array, floor: Array | None = None) -> Array:
     r"""Return the velocity v in a box with the least sum of squared violations of the rows ``matrix @ v >= least``.
 
-    A row that no velocity in the box violates has no effect. A row that every velocity in the box violates adds the
-    square :math:`(b - a^T v)^2` to the cost. Each of the other rows gets a slack variable. (The solver's own soft
-    constraints need no slack variables, but at active bounds their solutions violate rows that could be kept, as
-    observed with daqp 0.11.)
+    A row is an inequality :math:`a^T v \ge b`. A row that no velocity in the box violates has no effect. A row that
+    every velocity in the box violates adds the square :math:`(b - a^T v)^2` to the cost. Each of the other rows gets a
+    slack variable. (The solver daqp has soft constraints of its own, which need no slack variables. With daqp 0.11,
+    their solutions at active bounds violate rows that could be kept.)
 
     Args:
         box: bounds of each joint velocity.
@@ -30,7 +30,7 @@ def least_violation(box: Box, matrix: Array, least: Array, floor: Array | None =
             no such bounds.
 
     Returns:
-        Shape (n_joints,). Among several solutions, the velocity with the smallest norm.
+        The velocity v, shape (n_joints,) [rad/s]. Among several solutions, it is the velocity with the smallest norm.
     """
     n = matrix.shape[1]
     middle, half = 0.5 * (box.upper + box.lower), 0.5 * (box.upper - box.lower)

@@ -44,10 +44,11 @@ class Limit(ABC):
 
 
 class JointLimits(Limit):
-    r"""Position, velocity and acceleration limits of the joints, as a box that is never empty.
+    r"""Position, velocity and acceleration limits of the joints, combined to a box that is never empty.
 
-    Let D be the distance to the upper position limit and a the acceleration limit. A joint can stop before the position
-    limit only if its velocity is at most :math:`v_b(D)`:
+    Let D be the distance to the upper position limit [rad], a the acceleration limit [rad/s^2] and :math:`dt` the
+    length of a control step [s]. A joint can stop before the position limit only if its velocity is at most
+    :math:`v_b(D)`:
 
     .. math:: v_b(D) = -a\,dt + \sqrt{a^2 dt^2 + 2 a D}
 
@@ -68,7 +69,7 @@ class JointLimits(Limit):
         self._boxes: dict[float, _VelocityBox] = {}
 
     def restrict(self, problem: IKProblem) -> Box:
-        """Return the bounds at one control step; a joint outside its position limits can only move back."""
+        """Return the bounds in one control step; a joint outside its position limits can only move back."""
         known = self._boxes.get(problem.dt)
         if known is None:
             return self.box(problem.q, problem.dt, problem.velocity)

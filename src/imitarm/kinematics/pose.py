@@ -148,7 +148,7 @@ def rotate(q: ArrayLike, vectors: ArrayLike) -> Array:
 
 
 def continuous_signs(quaternions: ArrayLike) -> Array:
-    """Flip the signs of quaternions so that successive ones never jump from ``q`` to ``-q``.
+    """Flip the signs of quaternions so that no quaternion is followed by nearly its negative.
 
     Args:
         quaternions: unit quaternions wxyz in time order, shape (n, 4).

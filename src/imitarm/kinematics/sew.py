@@ -24,9 +24,8 @@ Array = NDArray[np.float64]
 Vector = tuple[Any, Any, Any]
 
 UP = (0.0, 0.0, 1.0)
-"""Upward direction.
-If the wrist is ahead of the shoulder, the angle is 0 when the elbow is above the line between shoulder and wrist.
-The angle is pi when the elbow is below this line."""
+"""Upward direction. If the wrist is in front of the shoulder, the angle is 0 when the elbow is above the line between
+shoulder and wrist. The angle is pi when the elbow is below this line."""
 _LOST = 1e-12  # squared sine below which an angle is only rounding
 
 
@@ -86,7 +85,7 @@ def sew_angle(
 def sew_derivatives(
     shoulder: ArrayLike, elbow: ArrayLike, wrist: ArrayLike, *, convention: str = "stereographic"
 ) -> SewAngle:
-    """Return the SEW angle and its derivatives by the three points; the arguments are those of :func:`sew_angle`."""
+    """Return the SEW angle and its derivatives with respect to the three points; arguments as in :func:`sew_angle`."""
     formula = _formula(convention)
     points = [np.asarray(point, dtype=float) for point in (shoulder, elbow, wrist)]
     if any(point.shape[-1:] != (3,) for point in points):
@@ -130,7 +129,7 @@ def one_angle(
         wrist: three floats [m].
         convention: see :func:`sew_angle`.
 
-    Returns: None where the angle is undefined.
+    Returns: The angle and its derivatives; None if the angle is undefined.
     """
     (sx, sy, sz), (ex, ey, ez), (wx, wy, wz) = shoulder, elbow, wrist
     try:

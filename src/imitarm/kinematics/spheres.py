@@ -27,7 +27,7 @@ class SphereCover:
         bodies: name of the body that carries each sphere.
         radii: radii of the spheres, shape (m,) [m].
         links: number of the arm's joints that move each sphere, shape (m,).
-        follows_last_joint: True for spheres that move rigidly with the flange, shape (m,).
+        follows_last_joint: True for each sphere that moves rigidly with the flange, shape (m,).
         base_centers: centers of the spheres that cover the base, which never moves, shape (b, 3) [m].
         base_radii: radii of the base's spheres, shape (b,) [m].
         joints: index of each of the arm's joints in the model, shape (n_joints,).
@@ -41,11 +41,11 @@ class SphereCover:
     """
 
     def __init__(self, model: mujoco.MjModel, working: mujoco.MjModel, names: Sequence[str]) -> None:
-        """Cover the shapes of a model.
+        """Cover the shapes of a model with spheres.
 
         Args:
             model: model with all shapes.
-            working: model with the same bodies, whose ``MjData`` the other methods expect.
+            working: model with the same bodies; the other methods take ``MjData`` of this model.
             names: names of the joints to which the columns of the Jacobians belong.
         """
         joints = np.array([model.joint(name).id for name in names])
@@ -147,8 +147,8 @@ class SphereCover:
             data: the kinematics of a posture.
             outer: indices of the spheres farther from the base, shape (k,); all joints that move the inner spheres
                 also move the outer spheres.
-            inner: indices of the spheres nearer to the base, shape (k,). The index of a sphere of the base itself is
-                higher than the indices of all moving spheres.
+            inner: indices of the spheres nearer to the base, shape (k,). The spheres of the base itself are numbered
+                after all moving spheres.
             centers: centers of the outer spheres, shape (k, 3) [m].
             normals: unit vectors from inner to outer, shape (k, 3).
         """

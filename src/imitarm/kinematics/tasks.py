@@ -32,7 +32,7 @@ _LEAST = 1e-4  # squared: a quantity that changes less with the self-motion can'
 
 
 class Task(Protocol):
-    """One wanted motion. To write your own task, implement this one method in a subclass."""
+    """One wanted motion. To write your own task, implement this method in a subclass."""
 
     def rows(self, problem: IKProblem) -> TaskRows | None:
         """Return the weighted rows of the task for one control step; None: no rows.
@@ -55,7 +55,7 @@ class TwistTask(NamedTuple):
         rotation_length: displacement with the same weight as a rotation of 1 rad, used when the joints can't achieve
             the whole twist [m]. With a smaller length, the rotation error becomes larger and the position error
             smaller. Three numbers apply to rotations about the base's x, y and z axes.
-        max_speed: largest weighted norm of the twist [m/s]; None: the default of the solver's method.
+        max_speed: largest weighted norm of the twist [m/s]; None: the default of the solver.
     """
 
     twist: ArrayLike
@@ -97,7 +97,7 @@ class JointVelocityTask(NamedTuple):
     weight: float = 1.0
 
     def rows(self, problem: IKProblem) -> TaskRows:
-        """Return a scaled identity (n_joints, n_joints) and the scaled velocity."""
+        """Return the weighted equations: an identity matrix (n_joints, n_joints) and the velocity, both scaled."""
         velocity = finite_vector(self.velocity, len(problem.q), "JointVelocityTask: velocity", "rad/s")
         root = _root(self.weight, "JointVelocityTask")
         return TaskRows(_scaled_eye(len(velocity), root), root * velocity)
@@ -123,7 +123,7 @@ class PostureTask(NamedTuple):
         return np.minimum(np.maximum(drift, problem.box.lower), problem.box.upper)
 
     def rows(self, problem: IKProblem) -> TaskRows:
-        """Return a scaled identity (n_joints, n_joints) and the scaled drift."""
+        """Return the weighted equations: an identity matrix (n_joints, n_joints) and the drift, both scaled."""
         root = _root(self.weight, "PostureTask")
         return TaskRows(_scaled_eye(len(problem.q), root), root * self.drift(problem))
 
@@ -147,11 +147,11 @@ class ElbowTask(NamedTuple):
 
     Attributes:
         angle: desired SEW angle :math:`\psi_h` [rad].
-        weight: weight w [m^2]; the weight of the tool's task is 1; 0 leaves the self-motion free.
+        weight: weight w [m^2], relative to the weight 1 of the tool's task; 0: the task has no effect.
         confidence: certainty c of the desired angle, 0 to 1; 0: the elbow is not moved.
         gain: k [1/s].
         max_rate: limit of the desired rate of the angle [rad/s].
-        convention: convention that defines the angle.
+        convention: convention of the SEW angle, see :func:`~imitarm.kinematics.sew.sew_angle`.
     """
 
     angle: float

@@ -30,9 +30,9 @@ _SAME_POSTURE = 1e-4  # [m, rad] the joints are planned from exactly where the a
 class ACFRA(PathPolicy):
     r"""Adapt the whole path once, then follow it (thesis Chapter 4).
 
-    The constructor decomposes the learned path into components, ``x_0(t)`` and their responsibilities ``h_k(t)``. The
-    method ``reset`` moves the means of those components that are near an obstacle, and raises an error when the
-    clearance can't be kept::
+    The constructor decomposes the learned path ``x_0(t)`` into Gaussian components with responsibilities ``h_k(t)``.
+    The method ``reset`` displaces the means of the components near an obstacle by ``Delta_k``. It raises an error when
+    the clearance can't be kept::
 
         x(t) = x_0(t) + w(t) sum_k h_k(t) Delta_k
 
@@ -45,28 +45,29 @@ class ACFRA(PathPolicy):
 
     Demonstrations may take several different paths, each of which has its own skill (see
     :func:`~imitarm.demonstrations.group_by_path`). The policy then adapts each of these paths between the same start
-    and goal, and follows the feasible path with the smallest displacement in standard deviations of its demonstrations.
+    and goal. It follows the feasible path with the smallest displacement, measured in standard deviations of the path's
+    own demonstrations.
 
     Args:
         skill: skill to reproduce.
-        alternatives: skills of the other demonstrated paths of the same task.
+        alternatives: one skill for each other demonstrated path of the same task.
         method: name in :data:`~imitarm.policies.ADAPTERS`.
         tool_radius: radius of one sphere about the tool's tip [m]; use it instead of ``tool_spheres``.
         tool_spheres: spheres that contain the tool, rows x y z r in the tool's frame, shape (m, 4) [m].
         clearance: required distance of the tool to every obstacle [m].
         forbidden: directions in which the motion must not leave the learned path, shape (m, 3).
         pinned: times at which the path must not move [s].
-        arm: the arm with its tool. The policy then plans the joints of the whole arm and follows them, and
-            ``tool_radius`` and ``tool_spheres`` are not used. None: only the path of the tool is planned.
+        arm: the arm with its tool. If given, the policy plans and follows a joint path of the whole arm, and does not
+            use ``tool_radius`` and ``tool_spheres``. None: the policy plans only the path of the tool.
         max_tilt: largest rotation of the tool of ``arm`` away from the learned rotation [rad]; see
             :func:`~imitarm.policies.adapt`.
         goal_tilt: largest rotation of the tool of ``arm`` at the goal [rad]; see :func:`~imitarm.policies.adapt`.
-        allowance: additional clearance for the robot's tracking errors, used if a path with this larger clearance is
-            found [m]. The default is 2 mm for a plan of the tool, and 5 mm for a plan of the whole arm.
+        allowance: additional clearance for the robot's tracking errors [m]; used only if a path with this larger
+            clearance is found. The default is 2 mm for a plan of the tool, and 5 mm for a plan of the whole arm.
         following: ``gain``, ``patience`` and ``arrival`` of :class:`~imitarm.policies.path_policy.PathPolicy`.
 
     Attributes:
-        adaptation: result of the last adaptation, also if it was refused.
+        adaptation: result of the last adaptation, even if the scene was refused.
     """
 
     def __init__(
@@ -151,7 +152,7 @@ class ACFRA(PathPolicy):
 
     @property
     def plan(self) -> Adaptation | None:
-        """The result of the last adaptation, for drawing in a report."""
+        """The result of the last adaptation; reports draw it."""
         return self.adaptation
 
 

@@ -89,9 +89,10 @@ def adapt(
     """Adapt the whole path of a skill to the obstacles of a scene.
 
     The method ``certified`` moves the affected components by the smallest displacement that keeps the clearance on the
-    whole path, or refuses and says why. The methods ``mapf`` and ``literal`` are the thesis's potential fields (see
-    ``potential_components``), which may fail. The path keeps its position at its start, at its goal and at the
-    ``pinned`` times. Specify the tool by exactly one of ``tool_radius``, ``tool_spheres`` and ``arm``.
+    whole path. If no displacement keeps the clearance, it refuses and gives the reason. The methods ``mapf`` and
+    ``literal`` are the thesis's potential fields (see ``potential_components``), which may fail. The path keeps its
+    position at its start, at its goal and at the ``pinned`` times. Specify the tool by exactly one of ``tool_radius``,
+    ``tool_spheres`` and ``arm``.
 
     The motion begins at time 0. At that time, the obstacles are at the poses given by the scene; from then on, they
     move with their velocities.
@@ -100,7 +101,7 @@ def adapt(
         skill: a fitted skill, or its decomposed path (``ComponentPath.of_skill``), which can be adapted to many scenes.
             A decomposed path has its own ends, pinned times and samples, so leave out ``pinned``, ``start`` and
             ``n_samples``. If the scene has a goal, the decomposed path must end there.
-        scene: goal (None: the learned one) and obstacles.
+        scene: goal and obstacles; if the goal is None, the learned goal is used.
         method: a name in ``ADAPTERS``: ``"certified"``, ``"mapf"``, ``"literal"`` or a registered method.
         tool_radius: the tool as one sphere of this radius about its tip [m]; 0 for a point.
         tool_spheres: the tool as spheres that contain it: rows x y z r in the tool's frame, shape (m, 4) [m]. The
@@ -112,24 +113,25 @@ def adapt(
         forbidden: directions in which no component may move, shape (m, 3): see ``HORIZONTAL_ONLY`` and ``NOT_DOWN``.
         pinned: times [s] at which the path must not move, for example contact points. With ``arm``, the tool is not
             tilted at these times either.
-        start: start of the motion; None: the learned start.
-        n_samples: samples along the path; None: 200.
+        start: pose of the tool at the start of the motion; None: the learned start.
+        n_samples: number of samples along the path; None: 200.
         state: measured state of ``arm``, from whose posture the motion starts; None: a posture near ``arm.home`` with
             the tool at the start.
         max_tilt: largest rotation of the tool of ``arm`` away from the learned rotation [rad]. At start and goal, this
             rotation is always 0. The default is two standard deviations of the demonstrated rotation, and 0 if no
             orientation was learned.
-        goal_tilt: largest rotation of the tool of ``arm`` away from the learned rotation at the goal [rad]; used only
-            if the arm, with the learned rotation, does not keep the clearance at the goal.
-        allowance: additional clearance for the tracking errors of the robot, used if a path with this larger clearance
-            is found [m].
-        margin: bound of the error with which obstacles are predicted, a ``CoverageMargin``. At time t, the distance to
-            an obstacle that a tracker estimates, or that moves, is then at least ``clearance + margin.at(t)``. The time
-            t counts from when the obstacle was seen. None: predictions are exact.
-        margin_horizon: time since an obstacle was seen after which its margin does not grow [s]; None: it always grows.
-        hold: time after the arrival for which the whole arm must keep its clearances at the goal too [s].
-        max_attempts: largest number of attempts of the search for a joint path, to limit the computing time; None: no
-            limit. Attempts to execute the path later, so that obstacles pass first, are not counted.
+        goal_tilt: largest rotation of the tool of ``arm`` away from the learned rotation at the goal [rad]. The tool is
+            rotated only if the arm does not keep the clearance at the goal with the learned rotation.
+        allowance: additional clearance for the tracking errors of the robot [m]; used only if a path with this larger
+            clearance is found.
+        margin: a ``CoverageMargin``, which bounds the error of the predicted obstacle positions. At time t, the
+            distance to an obstacle that a tracker estimates, or that moves, is then at least ``clearance +
+            margin.at(t)``. The time t counts from the time at which the obstacle was seen. None: predictions are exact.
+        margin_horizon: the margin grows until this time after the obstacle was seen [s]; None: it grows without end.
+        hold: the whole arm must keep its clearances at the goal for this long after the arrival [s].
+        max_attempts: largest number of attempts in the search for a joint path, to limit the computing time; None: no
+            limit. The search may also try to execute the path later, so that obstacles pass first; such attempts are
+            not counted.
 
     Returns:
         The adaptation; check ``feasible`` before executing it.
@@ -282,14 +284,14 @@ def of_whole_arm(
     began: float,
     margins: Sequence[PredictionMargin | None],
 ) -> Adaptation:
-    """Return the adaptation of the whole arm, given the adaptation of the tool alone, or of a motion that has begun.
+    """Return the adaptation of the whole arm that follows from the search for a joint path.
 
     Args:
-        tool: supplies all values that the plan of the whole arm does not change.
+        tool: the given adaptation, whose other values the result keeps.
         solution: result of the search for a joint path.
         scene: the obstacles.
-        clearance: required [m].
-        began: when the computation began, by ``time.perf_counter`` [s].
+        clearance: required clearance [m].
+        began: value of ``time.perf_counter`` when the computation began [s].
         margins: the margin of each obstacle; None for an obstacle without a margin.
     """
     plan, timing, spent = solution.plan, solution.timing, time.perf_counter() - began
@@ -372,7 +374,7 @@ def _spheres(path: ComponentPath, radius: float | None, spheres: ArrayLike | Non
 
 
 def allowed_directions(forbidden: ArrayLike) -> AllowedDirections:
-    """Return the directions in which components may move, given the forbidden ones, shape (m, 3).
+    """Return the directions in which components may move, given the forbidden directions, shape (m, 3).
 
     Raises:
         InputError: when a direction is zero or not finite.
@@ -405,7 +407,7 @@ def _detour(problem: AvoidanceProblem, adapter: PathAdapter) -> Detour:
 
 
 def depends_on_time(scene: Scene, margins: Sequence[PredictionMargin | None]) -> bool:
-    """Return whether a guarantee depends on the schedule: because an obstacle moves, or because a margin grows."""
+    """Return whether a guarantee depends on the schedule, because an obstacle moves or a margin grows."""
     growing = any(margin is not None and margin.growth > 0.0 for margin in margins)
     return growing or any(obstacle.velocity.any() for obstacle in scene.obstacles)
 

@@ -31,7 +31,7 @@ class Adaptation:
     """The path of a skill, adapted to a scene.
 
     Attributes:
-        nominal: the path without obstacles.
+        nominal: the path before it is adapted to the obstacles.
         trajectory: the adapted path, at the same times; if not ``feasible``, it is the best attempt, which must not be
             executed.
         displacement: displacement of each component's mean, shape (n_components, 3) [m].
@@ -39,20 +39,20 @@ class Adaptation:
         means: centres of the components before they moved, shape (n_components, 3) [m].
         covariances: position covariances of the components, shape (n_components, 3, 3) [m^2].
         responsibilities: responsibilities of each component for each sample, shape (n, n_components).
-        divided: whether the learned components were too wide for this scene; if so, the arrays above describe a larger
-            number of narrower components.
-        tolerance: covariance of the demonstrations along the path, shape (n, 3, 3) [m^2].
+        divided: whether the learned components were too wide for this scene and were divided. If so, the arrays above
+            describe more, narrower components.
+        tolerance: covariance of the demonstrated positions along the path, shape (n, 3, 3) [m^2].
         min_clearance: smallest distance from the tool's spheres to an obstacle, at the samples [m]; inf without
-            obstacles. Where an obstacle has a margin for the error of its prediction, the margin is subtracted.
-        certified_clearance: guaranteed lower bound of the clearance on the whole polyline through the samples [m]. It
-            is the clearance to the true obstacles, as long as they are within their margins of where they were
-            predicted.
+            obstacles. If an obstacle has a margin for its prediction error, the margin is subtracted from its distance.
+        certified_clearance: guaranteed lower bound of the clearance on the whole polyline through the samples [m]. The
+            bound holds for the true obstacles, as long as each one is within its margin of its predicted position.
         only_on_schedule: whether the guarantee depends on the schedule, because an obstacle moves or its margin grows.
             The guarantee then holds only while the motion is on time, which means that the tool reaches each sample of
             ``trajectory`` at the sample's time, counted from the scene's ``stamp``. The guarantee ends with the last
             sample.
         validity: text that says what the guarantee assumes and what it does not cover.
-        deviation: largest displacement of a mean, in standard deviations of the demonstrations (Mahalanobis distance).
+        deviation: largest displacement of a component's mean, in standard deviations of the demonstrations (Mahalanobis
+            distance).
         jerk_ratio: largest jerk of the adapted path, divided by the largest jerk of the nominal path.
         jerk_reason: why ``jerk_ratio`` exceeds 10; empty if it does not.
         feasible: whether ``certified_clearance`` reaches the required clearance and the path is within the method's

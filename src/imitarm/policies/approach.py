@@ -35,7 +35,7 @@ class Approach:
 
 
 def find_approach(around: ArmAmongObstacles, start: Array, end: Array, allowance: float) -> Approach | None:
-    """Return a short clear motion from one posture to another; None if none was found.
+    """Return a short collision-free motion from one posture to another, or None if no such motion was found.
 
     The motion is a straight line in joint space, or up to three straight lines that meet in intermediate postures.
 

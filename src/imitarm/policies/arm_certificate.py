@@ -1,21 +1,23 @@
-r"""Proof that a whole arm keeps its clearance on a joint path, between the samples too.
+r"""Proof that a whole arm keeps its clearance on a joint path, at the samples and between them.
 
 Between two samples every joint moves linearly, and the centre c of a sphere of the arm moves on an arc. The distance of
 this arc from the straight line between its two ends is at most :math:`e`:
 
 .. math:: e = \tfrac18 \sum_{i,j} |\Delta q_i|\,|\Delta q_j|\,R_{\max(i,j)}
 
-Here :math:`R_j` is the largest distance of the centre from the axis of joint j (1 for a prismatic joint). The bound
-holds because the second derivative of c with respect to the joints i and j has at most the norm :math:`R_{\max(i,j)}`.
-The signed distance to a convex obstacle is a convex function of the point, so the tangents at the two ends give a lower
-bound of the distance on the line. On the arc, the distance is at most e smaller than on the line. Where the resulting
-bound is too low, the segment is divided into halves, which makes e four times smaller.
+Here :math:`R_j` is the largest distance of the centre from the axis of joint j (1 for a prismatic joint). The bound e
+is valid because the second derivative of c with respect to the joints i and j has a norm of at most
+:math:`R_{\max(i,j)}`. The signed distance to a convex obstacle is a convex function of the point, so the tangents at
+the two ends give a lower bound of the distance on the line. The distance on the arc is therefore at least the distance
+on the line minus e. Where the resulting bound is too low, the segment is divided into halves, which makes e four times
+smaller.
 
-All of this remains true among obstacles with a constant velocity, in coordinates that move with the obstacle, and for
-the distance minus a margin that grows with time (:mod:`~imitarm.policies.prediction_margin`).
+For an obstacle with a constant velocity, the proof is the same in coordinates that move with the obstacle. The proof
+also holds for the distance minus a margin that grows with time (:mod:`~imitarm.policies.prediction_margin`).
 
-The same proof holds for two links of the arm. In the frame of the inner link, only the joints between the two links
-move the outer link, and the distance of a moving point from a fixed point is a convex function too.
+The proof also applies to the distance between two links of the arm. In the frame of the inner link, which is nearer to
+the base, only the joints between the two links move the outer link. The distance from a moving point to a fixed point
+is also a convex function.
 """
 
 from __future__ import annotations
@@ -48,11 +50,12 @@ _TINY = 1e-9  # [m] a joint that moves a sphere has at least this distance from 
 
 @dataclass(frozen=True)
 class ArmClearance:
-    """The smallest clearance of an arm on a joint path, and where it is.
+    """The smallest clearance of an arm on a joint path, and the place on the path that has it.
 
     Attributes:
-        room: distance minus required clearance and margin [m]. A value of at least 0 is a guaranteed lower bound on the
-            whole path. A negative value was measured at one point of the path; at other points, the value may be lower.
+        room: distance minus the required clearance and minus the margin [m]. A value of at least 0 is a guaranteed
+            lower bound on the whole path. A negative value was measured at one point of the path; at other points, the
+            value may be lower.
         obstacle: index of the obstacle; ``SELF`` for two links.
         sphere: index of the sphere of the arm; for two links, the sphere of the outer link.
         other: index of the sphere of the inner link; -1 for an obstacle.
@@ -74,9 +77,9 @@ class ArmAmongObstacles:
         obstacles: convex obstacles at time 0, which move at their velocities. A rotating obstacle is replaced by a
             sphere about its centre that contains it.
         clearance: required distance from every moving part of the arm to every obstacle [m].
-        fixtures: objects on which the arm stands or works, such as a table. If a part of the arm is nearer to a fixture
-            than ``clearance`` in one of the postures ``contacts`` or at home, this part may come as near as in that
-            posture. All other parts keep the clearance.
+        fixtures: objects on which the arm stands or works, such as a table. In one of the postures ``contacts`` or at
+            home, a part of the arm may be nearer to a fixture than ``clearance``. This part may then always come as
+            near as in that posture. All other parts keep the clearance.
         contacts: postures in which parts of the arm may be near fixtures, shape (k, n_joints) [rad].
         own: the links that must stay apart, and their required clearance; None: links are not checked.
         margins: the margin of each obstacle, or None for an obstacle without a margin; None: there are no margins.
@@ -113,7 +116,7 @@ class ArmAmongObstacles:
 
     @cached_property
     def without_margins(self) -> ArmAmongObstacles:
-        """The same, with obstacles that have no margins."""
+        """The same surroundings, but with obstacles that have no margins."""
         if all(pairs.margin is None for pairs in self._pairs):
             return self
         other = copy(self)
@@ -132,7 +135,7 @@ class ArmAmongObstacles:
             path: the arm at n samples.
             times: time of each sample [s], shape (n,).
             reach: pairs are returned if their ``room`` (distance minus required clearance) is less than this [m].
-            connected: whether the samples are those of a path; otherwise, they are unrelated postures.
+            connected: whether the samples form a path; if False, they are unrelated postures.
         """
         found = []
         for pairs in self._pairs:
@@ -146,14 +149,14 @@ class ArmAmongObstacles:
         return Gaps.of(path, times, found)
 
     def closing(self, path: ArmPath, times: Array, velocity: Array, obstacles: Shrinking, links: Shrinking) -> Gaps:
-        """Return the pairs that a motion may bring together faster than allowed.
+        """Return the pairs whose distance may shrink faster than allowed during a motion.
 
         Args:
             path: the arm at n samples.
             times: time of each sample [s], shape (n,).
             velocity: joint velocities, shape (n, n_joints) [rad/s].
-            obstacles: how fast distances to obstacles may shrink.
-            links: how fast distances between links may shrink.
+            obstacles: largest permitted rate at which distances to obstacles shrink.
+            links: largest permitted rate at which distances between links shrink.
         """
         found = []
         for pairs in self._pairs:
@@ -163,12 +166,12 @@ class ArmAmongObstacles:
         return Gaps.of(path, times, found)
 
     def clearance_at(self, path: ArmPath, times: Array, reach: float) -> ArmClearance:
-        """Return the smallest clearance at the samples of a path; a ``room`` above ``reach`` is reported as ``reach``.
+        """Return the smallest clearance at the samples of a path; if its room exceeds ``reach``, return ``reach``.
 
         Args:
             path: the arm at n samples.
             times: time of each sample [s], shape (n,).
-            reach: upper bound of ``room``: if every pair has more room, the ``room`` of the result is ``reach`` [m].
+            reach: if every pair has more room than this, the room of the result is ``reach`` [m].
         """
         return lowest_of(self.gaps(path, times, reach), reach)
 
@@ -209,7 +212,7 @@ class ArmAmongObstacles:
 
 
 def lowest_of(gaps: Gaps, reach: float) -> ArmClearance:
-    """Return the smallest clearance of several pairs; ``reach`` [m] if there is no pair."""
+    """Return the smallest clearance of several pairs; if there is no pair, its room is ``reach`` [m]."""
     if not len(gaps):
         return ArmClearance(reach, 0, -1, -1, 0)
     i = int(np.argmin(gaps.room))
@@ -218,12 +221,12 @@ def lowest_of(gaps: Gaps, reach: float) -> ArmClearance:
 
 
 class Shrinking(NamedTuple):
-    """How fast a distance may shrink: at most at ``rate`` times the sum of its room and a margin.
+    """Limit of the rate at which a distance may shrink: ``rate`` times the sum of the room and a margin.
 
     Attributes:
         rate: [1/s].
         margin: [m].
-        most: pairs with more room than this do not matter [m].
+        most: pairs with more room than this are not limited [m].
     """
 
     rate: float
@@ -327,8 +330,8 @@ def bows(steps: Array, radii: Array) -> Array:
 
     Args:
         steps: absolute motion of each joint, shape (k, n_joints) [rad].
-        radii: distance of the point from the axis of each joint: the larger of the distances at the two ends of the
-            arc; 0 for joints that do not move the point, shape (k, n_joints) [m].
+        radii: distance of the point from the axis of each joint, taken at the end of the arc where it is larger, shape
+            (k, n_joints) [m]; 0 for joints that do not move the point.
     """
     steps = np.where(radii > 0.0, steps, 0.0)
     whole, farther = radii.copy(), np.zeros(len(steps))

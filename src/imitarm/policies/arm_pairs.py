@@ -1,10 +1,10 @@
 """Pairs of a sphere of the arm and an obstacle, or of two spheres of the arm, and which of them are near each other.
 
-An arm has thousands of such pairs, and few of them are near each other on any part of a path. Two cheap bounds leave
-out most of the others. First, between two postures, no sphere of a link moves farther than ``ArmPath.travel`` says. The
-distances are therefore measured at few postures first, and only pairs that could be near at one of the postures around
-such a posture are measured there too. Second, an obstacle is inside a sphere, which is cheaper to measure than the
-obstacle.
+An arm has thousands of such pairs, but at most places of a path only few of them are near each other. Two cheap bounds
+exclude most of the distant pairs. First, between two postures, no sphere of a link moves farther than
+``ArmPath.travel`` says. The distances are therefore first measured at few postures of the path. At the postures in
+between, only the pairs that could be near are measured. Second, each obstacle is inside a bounding sphere, whose
+distance takes less time to compute.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
 SELF = -1
-"""Stands in place of an obstacle's index where a distance is between two links of the arm."""
+"""Value used instead of an obstacle's index if a distance is between two links of the arm."""
 _BLOCK_TRAVEL = 0.3  # [m] the first blocks are so short that the arm moves at most about this far in one
 _ROUNDING = 1e-4  # [m] of the distances between links, which are first measured in single precision
 
@@ -48,7 +48,7 @@ class Pairs(ABC):
         moves: whether each joint changes the distance of each pair, shape (n_pairs, n_joints).
         group: index of the group of each pair: pairs of the same links, shape (n_pairs,).
         velocity: velocity of the obstacle, shape (3,) [m/s].
-        margin: margin of the obstacle, which the room does not include; None: there is none.
+        margin: margin of the obstacle, which is subtracted from the room; None: no margin.
     """
 
     velocity: Array = np.zeros(3)
@@ -106,7 +106,7 @@ class Pairs(ABC):
         return other
 
     def travel(self, path: ArmPath, times: Array) -> Array:
-        """Return bounds of the change of distance from sample to sample, shape (n - 1, n_groups) [m]."""
+        """Return upper bounds of the change of distance between neighbouring samples, shape (n - 1, n_groups) [m]."""
         way = path.travel[:, self._of_groups[0], self._of_groups[1]]
         if self.velocity.any():
             way = way + (float(np.linalg.norm(self.velocity)) * np.diff(times))[:, None]
@@ -130,8 +130,8 @@ class Pairs(ABC):
         Args:
             path: the arm at n samples.
             times: time of each sample [s], shape (n,).
-            reach: limit for each sample and each group, shape (n, n_groups) [m].
-            travel: the result of :meth:`travel`; None if the samples are not those of a path.
+            reach: limit of the room for each sample and each group, shape (n, n_groups) [m].
+            travel: the result of :meth:`travel`; None if the samples do not form a path.
 
         Returns:
             For each pair, the index of the sample, the index of the pair, and its room [m].
@@ -167,8 +167,9 @@ class Pairs(ABC):
             times: time of each of the k samples [s].
 
         Returns:
-            The spheres' centres relative to the obstacle, or to the inner sphere in the frame of its link, (k, 3) [m];
-            the room (k,) [m]; and its gradient with respect to this centre (k, 3).
+            Three arrays. The first has the centres of the pairs' spheres, shape (k, 3) [m]: relative to the obstacle,
+            or relative to the inner sphere in the frame of its link. The second has the room of each pair, shape (k,)
+            [m]. The third has the gradients of the room with respect to the centre, shape (k, 3).
         """
         points = self._points(path, sample, pair, times)
         return points, *self._measured(points, pair, times)
@@ -319,7 +320,7 @@ class Gaps:
         path: the arm at the samples.
         times: time of each sample [s].
         sources: the pairs of each obstacle, and of the links.
-        source: index in ``sources``, shape (k,).
+        source: index of each pair's source in ``sources``, shape (k,).
         pair: index of the pair in its source, shape (k,).
         sample: index of the sample of the path, shape (k,).
         room: distance minus required clearance, shape (k,) [m].
@@ -358,7 +359,7 @@ class Gaps:
         return len(self.room)
 
     def normals(self, chosen: Index) -> Array:
-        """Return the unit vectors along which spheres move away fastest, in the base frame, shape (m, 3)."""
+        """Return unit vectors in the base frame along which the distances of pairs grow fastest, shape (m, 3)."""
         normals = np.empty((len(chosen), 3))
         for i, pairs in enumerate(self.sources):
             of = np.flatnonzero(self.source[chosen] == i)

@@ -1,15 +1,15 @@
 r"""Joint paths on which the whole arm keeps its clearance, found by improving a displacement of the learned path.
 
-Three sets of numbers describe the motion: the displacements :math:`\Delta` of the components of the learned path, a
-rotation of the tool away from the learned rotation (the *tilt* :math:`\tau`), and the self-motion :math:`\psi`, which
-moves the arm but not its tool. Smooth functions of time, :math:`B`, turn each set of numbers into a function of time.
-Near a joint path q(t), a small change of these numbers changes the joint positions by :math:`\delta q`:
+Three sets of coefficients describe the motion. The displacements :math:`\Delta` move the components of the learned
+path. The *tilt* :math:`\tau` rotates the tool away from the learned rotation. The self-motion :math:`\psi` moves the
+arm but not its tool. Each set is multiplied by smooth functions of time, :math:`B`. Near a joint path q(t), small
+changes of the coefficients change the joint positions by :math:`\delta q`:
 
 .. math:: \delta q(t) = J^+(t) \begin{bmatrix} B_\Delta(t)\,\delta\Delta \\ B_\tau(t)\,\delta\tau \end{bmatrix}
           + N(t)\,B_\psi(t)\,\delta\psi
 
 Here :math:`J^+` is the right inverse of the tool's Jacobian, and N is a basis of its null space. To first order, every
-distance between a part of the arm and an obstacle changes linearly with these numbers. In each round, a quadratic
+distance between a part of the arm and an obstacle is a linear function of these changes. In each round, a quadratic
 program finds the smallest displacement and tilt for which all linearised distances reach the required clearance and the
 joints stay within their limits. Inverse kinematics then brings the tool exactly to its poses. The next round begins
 with this joint path; the rounds end when all distances reach the required clearance.
@@ -72,10 +72,10 @@ class ArmPlan:
         tilts: the rotations of the tool away from the learned rotation that the plan can choose from.
         tilt: the chosen coefficients of ``tilts``, shape (n_tilts, 3) [rad].
         path: the arm at the samples.
-        clearance: the smallest clearance and its place. If it is not negative and ``complete`` is True, it is certified
-            for the whole path.
-        complete: whether ``path`` has all samples of the component path.
-        cost: squared size of displacement and tilt, in demonstrated standard deviations.
+        clearance: the smallest clearance and its place on the path. If its room is at least 0 and ``complete`` is True,
+            the clearance is certified for the whole path.
+        complete: whether ``path`` has all samples of the component path, not only the coarse ones.
+        cost: sum of the squares of displacement and tilt, both in standard deviations of the demonstrations.
         largest_tilt: largest rotation of the tool away from the learned rotation [rad].
         speed: largest joint speed, as a fraction of the joint's limit, if the path is executed at the learned times.
     """
@@ -98,7 +98,7 @@ class ArmPlan:
 
 
 class ArmPlanner:
-    """Plans joint paths for one component path among one set of obstacles.
+    """Plans joint paths for one decomposed path of the tool among one set of obstacles.
 
     Args:
         around: the arm, its obstacles and the required clearances.
@@ -107,14 +107,14 @@ class ArmPlanner:
         max_tilt: largest rotation away from the learned rotation at each sample, shape (n,) [rad].
         allowed: directions in which components may move.
         smoothness: weight of the squared jerk of the displacement (see ``style_scale``).
-        free_start: whether the self-motion may change the posture at the start.
+        free_start: whether the self-motion of the plan may change the posture at the start.
         tilts: possible rotations of the tool away from the learned rotation; at the goal, ``max_tilt`` limits them too.
-        begun: whether the motion has begun, so that the self-motion must not change the velocity at the start.
-        spare: clearance that is planned for in addition, if possible, but not required [m].
+        begun: whether the motion has begun; if so, the self-motion must not change the velocity at the start.
+        spare: additional clearance that the planner aims at but does not require [m].
         quick: whether to give up after fewer rounds.
 
     Attributes:
-        coarse: indices of the few samples that are planned first, before all samples, shape (k,).
+        coarse: indices of the few samples that are planned first, shape (k,); all samples are planned afterwards.
         clock: time at which the arm reaches each sample, used for moving obstacles, shape (n,) [s]; initially the times
             of the learned motion.
     """
@@ -333,9 +333,9 @@ class ArmPlanner:
 
 
 JOINT_LIMIT = SELF - 1
-"""Stands for a joint limit where an obstacle's index is expected; ``sphere`` is then the index of the joint."""
+"""Value used instead of an obstacle's index for a joint limit; ``sphere`` is then the index of the joint."""
 TILT_LIMIT = SELF - 2
-"""Stands for the limit of the tool's tilt where an obstacle's index is expected."""
+"""Value used instead of an obstacle's index for the limit of the tool's tilt."""
 TILT_LEVER = 0.05
 """[m/rad] Factor that converts the amount by which a tilt exceeds its limit to a missing clearance."""
 

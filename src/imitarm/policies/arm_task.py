@@ -27,7 +27,7 @@ class ArmSolution:
     Attributes:
         plan: the plan, or the best attempt; None when the arm can't follow the path at all.
         timing: execution times of the plan; None if no plan is feasible.
-        reason: why there is no plan; empty if there is one.
+        reason: text that says why no plan was found; empty if a plan was found.
         approach: motion from the task's start posture to the plan's first posture; None if the two are the same.
     """
 
@@ -38,7 +38,7 @@ class ArmSolution:
 
     @property
     def duration(self) -> float:
-        """Duration of the approach and of the plan [s]; inf without a timing."""
+        """Duration of the approach plus the plan [s]; inf if no plan is feasible."""
         own = np.inf if self.timing is None else float(self.timing.times[-1])
         return own if self.approach is None else own + float(self.approach.times[-1])
 
@@ -55,10 +55,11 @@ class ArmTask:
         allowed: directions in which the components of the path may be displaced.
         max_tilt: largest rotation of the tool away from the learned rotation at each sample, shape (n,) [rad].
         allowance: ``clearance`` minus the clearance that the safety filter keeps [m].
-        rest: the rest of a motion that has begun; None: the motion begins at rest.
+        rest: the remainder of a motion that has begun; None: the motion has not begun, and the arm stands still.
         margins: the margin of each obstacle, or None for an obstacle without a margin; None: there are no margins.
-        hold: time after the arrival for which the arm must keep its clearances at the goal [s].
-        max_attempts: largest number of attempts, apart from those that execute the path later; None: no limit.
+        hold: the arm must keep its clearances at the goal for this long after the arrival [s].
+        max_attempts: largest number of attempts of the search; None: no limit. Attempts that only execute the path
+            later are not counted.
     """
 
     arm: ArmModel

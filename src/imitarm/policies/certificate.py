@@ -1,15 +1,17 @@
 """Proof that a path keeps its clearance: convexity gives a lower bound of the distance on every straight segment.
 
 The signed distance to a convex obstacle is a convex function, so its tangent plane at any point is a lower bound
-everywhere. The tangents at two samples therefore bound the distance on the whole segment between them: the polyline
-itself is certified, not a set of samples. Where that bound is too low, the distance is measured at further points of
-the segment, until either the bound reaches the required clearance or one of these points is too close.
+everywhere. The tangents at two samples therefore bound the distance on the whole segment between them. The proof thus
+certifies the whole polyline, not only the samples. If the bound on a segment is too low, the distance is measured at
+further points of the segment. This ends when the bound reaches the required clearance, or when one of these points is
+too close.
 
 An obstacle that moves at a constant velocity ``v`` stands still in coordinates that move with it. If ``t v`` is
-subtracted from the path, the same proof is exact for a moving obstacle, as long as the path is executed on time.
+subtracted from the position at each time t, the same proof is exact for a moving obstacle. The path must then be
+executed on time.
 
 An obstacle may have a margin that grows with time (:mod:`~imitarm.policies.prediction_margin`). The distance minus this
-margin is a convex function too. In this module, all distances to such an obstacle are distances minus its margin.
+margin is also a convex function. In this module, all distances to such an obstacle are distances minus its margin.
 """
 
 from __future__ import annotations
@@ -69,20 +71,20 @@ class ToolAmongObstacles:
     """The spheres that contain the tool, and the obstacles that these spheres must not approach too closely.
 
     One sphere and one obstacle form a *pair*: pair ``i`` is obstacle ``i // n_spheres`` with sphere
-    ``i % n_spheres``. The tool rotates as on the nominal path, so the centre of a sphere is the position of the tip
-    plus a known offset at each sample.
+    ``i % n_spheres``. The tool rotates in the same way as on the nominal path. At each sample, the centre of a sphere
+    is therefore the position of the tip plus a known offset.
 
     Attributes:
         obstacles: convex obstacles; a rotating obstacle is replaced by a sphere that contains it.
         spheres: centres in the tool's frame and radii, rows x y z r, shape (n_spheres, 4) [m].
         radii: radii of the spheres, shape (n_spheres,) [m].
-        offsets: for each obstacle, an array of shape (n_spheres, n, 3) [m]. The array contains, for each sample, the
-            vectors from the tip to the centres of the spheres, minus the obstacle's displacement since time 0, in the
-            base frame. The entry is None when all its vectors are zero.
-        bows: for each segment between two samples, how far the rotation of the tool can move the centre of a sphere
-            away from the straight line between the centre's positions at the two samples, shape (n_spheres, n - 1) [m].
+        offsets: for each obstacle, an array of shape (n_spheres, n, 3) [m], or None if all its vectors are zero. The
+            array contains the vector from the tip to the centre of each sphere at each sample, minus the obstacle's
+            displacement since time 0, in the base frame.
+        bows: largest deviation of each sphere's centre from a straight line, on each segment between two samples, shape
+            (n_spheres, n - 1) [m]. The rotation of the tool causes this deviation.
         times: time of each sample, shape (n,) [s].
-        margins: the margin of each obstacle; None: it has none.
+        margins: for each obstacle, its margin, or None for an obstacle without a margin.
     """
 
     obstacles: tuple[Obstacle, ...]
@@ -172,17 +174,17 @@ class ToolAmongObstacles:
         return np.asarray(self.obstacles[obstacle].distances_at(centres, gradient=False)[0] - kept_off)
 
     def margin(self, pair: int, samples: Index | slice) -> Array | float:
-        """Return the margin of a pair's obstacle at m samples, shape (m,) [m]; the number 0 if it has none."""
+        """Return the margin of a pair's obstacle at m samples, shape (m,) [m]; 0 if the obstacle has no margin."""
         margin = self.margins[pair // self.n_spheres]
         return 0.0 if margin is None else margin.at(self.times[samples])
 
     def margin_between(self, pair: int, segment: Index, fraction: Array) -> Array | float:
-        """Return the margin of a pair's obstacle at points between samples; the number 0 if it has none.
+        """Return the margin of a pair's obstacle at points between samples; 0 if the obstacle has no margin.
 
         Args:
             pair: index of the pair.
             segment: index of the sample before each point, shape (m,).
-            fraction: position of the point between this sample (0) and the next one (1), shape (m,).
+            fraction: position of the point between this sample (0) and the next sample (1), shape (m,).
 
         Returns:
             Shape (m,) [m], or 0.
@@ -213,17 +215,18 @@ class ToolAmongObstacles:
         tolerance: float,
         margin: Array | float = 0.0,
     ) -> Array:
-        """Return how far points must move along directions to leave the inflated obstacle.
+        """Return the distance that points must move along directions to leave the inflated obstacle.
 
-        The inflated obstacle contains all points at which the pair's distance is below ``target``. Newton's method
-        starts beyond it. Because the signed distance along a ray is convex, the computed displacement decreases towards
-        the last crossing of the inflated obstacle's surface, and never passes this crossing.
+        The inflated obstacle contains all points at which the pair's distance is below ``target``. A ray leaves the
+        inflated obstacle at its last crossing of the surface. Newton's method starts beyond this crossing. Because the
+        signed distance along a ray is convex, the computed displacement decreases towards the crossing and never falls
+        below it.
 
         Args:
             pair: index of the pair.
             points: positions of the centre of the pair's sphere, shape (p, 3) [m].
-            directions: unit rows, shape (m, 3).
-            target: distance to reach [m].
+            directions: unit vectors, one for each row, shape (m, 3).
+            target: distance of the pair that the points must reach [m].
             tolerance: largest accepted excess of the distance over ``target`` [m].
             margin: results of :meth:`margin` for the same points, shape (p,) [m].
 
@@ -294,9 +297,9 @@ class PathClearance:
 
         Let ``f`` be a convex function on a segment of length L, with slope a at the start and b at the end. Then ``f(s)
         >= max(f0 + a s, f1 - b (L - s))``. The minimum of this bound over s is at an end of the segment, or where the
-        two terms of the maximum are equal. The tip moves straight between two samples. While the tool rotates by
-        ``angle``, a sphere's centre that is not at the tip deviates from the straight line by at most ``|offset| (1 -
-        cos(angle / 2))``. This largest deviation is subtracted from the bound of the distance.
+        two terms of the maximum are equal. The tip moves straight between two samples. If a sphere's centre is not at
+        the tip, a rotation of the tool by ``angle`` makes the centre deviate from the straight line by at most
+        ``|offset| (1 - cos(angle / 2))``. This largest deviation is subtracted from the bound of the distance.
 
         Returns:
             Shape (n_pairs, n - 1) [m].
@@ -323,11 +326,10 @@ class PathClearance:
         """Bound the distance on each segment, and refine the bound where it is below a clearance.
 
         Near a corner of an obstacle, the bound from the tangents at the two ends of a segment is much too low. The
-        distance is therefore measured at the point where the tangents cross. If the distance there is below the
-        clearance, the path really is too close to the obstacle. Otherwise, this point replaces one of the two ends of
-        the segment: the first end if the distance still decreases at this point, and the last end if the distance
-        increases. The minimum of the distance therefore stays between the two ends, and the bound converges to this
-        minimum.
+        distance is therefore measured at the point where the tangents cross. If this distance is below the clearance,
+        the path is really too close to the obstacle. Otherwise, the point replaces one end of the segment. It replaces
+        the first end if the distance still decreases at the point, and the last end if the distance increases. The
+        minimum of the distance therefore stays between the two ends, and the bound converges to this minimum.
 
         Args:
             clearance: required clearance [m].

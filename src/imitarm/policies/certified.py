@@ -1,28 +1,28 @@
-"""Displace as few components as little as possible so that the whole path keeps its clearance, or refuse and say why.
+"""Find the smallest displacement of components with which the whole path keeps its clearance, or refuse the scene.
 
 The algorithm of :func:`find_detour`:
 
 1. **Side.** Take the obstacle with the largest violation. Try directions across the path. Along each direction, the
    lift of a violated sample is the distance by which the sample must move to leave the inflated convex obstacle.
-   Newton's method computes the lift, starting from a point outside the obstacle; because the signed distance is convex,
-   the method never overshoots. A small quadratic program computes the smallest amplitudes of the components that give
-   this lift. The search follows the direction of least cost first, until nothing is violated. The cost is the
-   displacement relative to the demonstrated variance, plus the remaining violation. The other directions are kept and
-   tried later if this direction fails.
+   Newton's method computes the lift from a starting point outside the obstacle. The signed distance is convex, so
+   Newton's method never overshoots. A small quadratic program computes the smallest displacements of the components
+   that give this lift. The search first follows the direction of least cost, until no sample violates the clearance.
+   The cost is the displacement relative to the demonstrated variance, plus the remaining violation. If this direction
+   fails, the other directions are tried later.
 2. **Least detour** (:mod:`~imitarm.policies.least_detour`): the smallest displacement that keeps the clearance and
    passes each obstacle on the chosen side.
 3. **Certificate** (:mod:`~imitarm.policies.certificate`): a lower bound of the distance on the whole path, not only at
    samples.
 4. If the search over sides finds no path, a grid of positions (:mod:`~imitarm.policies.passages`) often proves that
-   there is none. Otherwise, a second search treats all samples together. It takes routes from a roadmap
-   (:mod:`~imitarm.policies.roadmap`), and follows each route first with the learned components, then with more and
-   narrower ones. If components can move only in a plane, the grid and the roadmap are built earlier: as soon as the
-   next choice of sides costs more than 70 % of the previous choice. Then they decide: if there is no route, the search
-   over sides ends, otherwise the search over sides continues. If no route of the roadmap leads to a path, a last
-   attempt follows the cheapest chain of the grid's cells.
-5. If the path is displaced by more than twice the depth by which the learned path violates the clearance, the learned
-   components are too wide for this scene, or the side is not a good one. A route of the roadmap is then followed with
-   narrower components, and the path with the smaller mean deviation from the demonstrations is returned.
+   no path exists. Otherwise, a second search treats all samples together. The second search takes routes from a roadmap
+   (:mod:`~imitarm.policies.roadmap`), and follows each route first with the learned components, then with more,
+   narrower components. If components can move only in a plane, the grid and the roadmap are built earlier: as soon as
+   the next choice of sides costs more than 70 % of the previous choice. If they contain no route, the search over sides
+   ends. If no route of the roadmap leads to a path, a last attempt follows the cheapest chain of the grid's cells.
+5. The displacement may be more than twice the depth by which the learned path violates the clearance. In this case, the
+   learned components are too wide for the scene, or the chosen side is bad. A route of the roadmap is then followed
+   with narrower components. Of the two paths, the path with the smaller mean deviation from the demonstrations is
+   returned.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""CertifiedRCAMO: among moving obstacles, plan the rest of the motion again and again, with a certificate each time."""
+"""CertifiedRCAMO: among moving obstacles, plan the rest of the motion again and again, each time with a certificate."""
 
 from __future__ import annotations
 
@@ -50,52 +50,53 @@ class _Stopping:
 class CertifiedRCAMO(Policy):
     r"""Re-plan the rest of the motion many times a second; follow only plans that are certified for the whole arm.
 
-    Each plan begins at the measured state of the arm, with the obstacles as seen now and their velocities. The whole
-    arm keeps, at each time t of the plan,
+    Each plan begins at the measured state of the arm. It uses the observed obstacles and their velocities. At each time
+    t of the plan, the distance of the whole arm to each predicted obstacle i is at least
 
     .. math:: d_i(t) \ge c + m_i(t)
 
-    to each predicted obstacle i (:mod:`~imitarm.policies.prediction_margin`). If the path can't pass an obstacle in
-    time, a plan may wait until the obstacle has passed (:mod:`~imitarm.policies.retiming`). A plan is void as soon as
-    one of its assumptions fails (:mod:`~imitarm.policies.plan_in_execution`): the arm is off schedule, or an obstacle
-    is new or has left its margin, and the rest of the plan is not clear of it. Another plan is then made at once. The
-    policy acts as follows:
+    Here, c is the required clearance and :math:`m_i` is the margin for the error of the prediction
+    (:mod:`~imitarm.policies.prediction_margin`). If the path can't pass an obstacle in time, a plan may wait until the
+    obstacle has passed (:mod:`~imitarm.policies.retiming`). A plan becomes void as soon as one of its assumptions fails
+    (:mod:`~imitarm.policies.plan_in_execution`). The arm may be off schedule; or an obstacle may be new, or outside its
+    margin, and too close to the rest of the plan.
+    The policy then makes another plan at once. There are three cases:
 
-    1. A certified plan exists: the arm follows it.
-    2. No plan is certified, but the arm can brake to rest and stay there for a while, which is certified
-       (:func:`~imitarm.policies.stopping.certified_stop`): the arm brakes and waits.
-    3. Neither is certified, for example because an obstacle comes towards the arm:
-       :class:`~imitarm.policies.rcamo.RCAMO` commands the arm, which evades without a certificate.
+    1. If a certified plan exists, the arm follows this plan.
+    2. If no plan is certified, but braking to rest and waiting there is certified
+       (:func:`~imitarm.policies.stopping.certified_stop`), the arm brakes and waits.
+    3. If neither a plan nor a stop is certified, for example because an obstacle comes towards the arm,
+       :class:`~imitarm.policies.rcamo.RCAMO` commands the arm. The arm then evades without a certificate.
 
-    In all cases the status and its reason name the obstacle, and the arm resumes as soon as a plan is certified. The
-    :class:`~imitarm.safety.SafetyFilter` should check every command, as for all policies. If only standing obstacles
-    make the motion impossible, ``reset`` refuses to start; if a moving obstacle does, the arm waits.
+    In all cases the status and its reason name the obstacle, and the arm resumes as soon as a plan is certified. A
+    :class:`~imitarm.safety.SafetyFilter` should check every command, as for all policies. If obstacles at rest make the
+    motion impossible, ``reset`` refuses to start. If a moving obstacle makes the motion impossible, the arm waits.
 
-    In a simulation, the plan is made within ``step``, and simulated time stands still meanwhile. A real system plans in
-    another process and takes up the plan when it is ready. Set ``planning_time`` to the duration that planning takes
-    there. A plan is then made for the state predicted at that later time, and used from then on.
+    In a simulation, ``step`` computes the plan while the simulated time stands still. A real system computes the plan
+    in another process, and uses it as soon as it is ready. Set ``planning_time`` to the time that this takes. A plan
+    then begins at the state that is predicted for the end of this time, and takes effect then.
 
     Args:
         skill: skill to reproduce.
         rate: number of plans per second [Hz].
-        margin: bound of the error with which obstacles are predicted, a ``CoverageMargin``; None: predictions are
+        margin: a ``CoverageMargin``, which bounds the error of the predicted obstacle positions; None: predictions are
             exact.
-        margin_horizon: time since an obstacle was seen after which its margin does not grow [s]; None: it always grows.
-            It should cover the time until the next plans and the time for braking.
+        margin_horizon: the margin grows until this time after the obstacle was seen [s]; None: it grows without end.
+            Choose a time that covers the next plans and the braking.
         planning_time: time from an observation until the plan made from it takes effect [s].
         max_tilt: see :func:`~imitarm.policies.adapt`.
         goal_tilt: see :func:`~imitarm.policies.adapt`.
         pinned: see :func:`~imitarm.policies.adapt`.
-        allowance: additional clearance for tracking errors, used if a plan with it is found [m].
-        hold: time after the arrival for which a plan must be clear at the goal [s]; also the time for which a stop must
-            be clear.
-        gain: feedback of the joint positions [1/s].
+        allowance: additional clearance for tracking errors [m], used if a plan with this larger clearance is found.
+        hold: a plan must keep its clearances at the goal for this long after the arrival [s]; a stop must keep them for
+            this long, too.
+        gain: feedback gain of the joint positions [1/s].
         arrival: the motion has arrived when the tool is nearer than this to the goal [m].
         options: arguments of :class:`~imitarm.policies.Policy`; ``arm`` is required.
 
     Attributes:
         plans: number of plans that were tried since ``reset``.
-        certified: number of those that were certified.
+        certified: number of these plans that were certified.
     """
 
     def __init__(

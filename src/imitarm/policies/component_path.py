@@ -55,9 +55,9 @@ class ComponentPath:
 
     Attributes:
         nominal: the path without obstacles, n samples.
-        fixed_times: times at which the path must not move: start, pinned times, goal [s].
+        fixed_times: times at which the path must not be displaced [s]: the start, the pinned times and the goal.
         responsibilities: h, shape (n, n_components).
-        basis: products w h of the window and the responsibilities, shape (n, n_components); never negative.
+        basis: products of the window w and the responsibilities h, at least 0, shape (n, n_components).
         means: centres of the components on the nominal path, shape (n_components, 3) [m].
         covariances: position covariances of the components, with the lower bound (5 mm)^2, (n_components, 3, 3) [m^2].
             The covariances also include the motion itself, so a component is elongated along the path.
@@ -66,8 +66,8 @@ class ComponentPath:
         centres: index of the sample at the centre of each component, (n_components,).
         precisions: inverses of ``yields``, (n_components, 3, 3) [1/m^2].
         tolerance: GMR covariance along the path, shape (n, 3, 3) [m^2].
-        rotation_tolerance: two standard deviations of the demonstrated rotation along the path, in the direction in
-            which it varies most, shape (n,) [rad]; 0 without a learned orientation.
+        rotation_tolerance: two standard deviations of the demonstrated rotation along the path, about the axis of
+            largest variation, shape (n,) [rad]; 0 if no orientation was learned.
     """
 
     nominal: Trajectory
@@ -148,7 +148,7 @@ class ComponentPath:
 
     @cached_property
     def fixed(self) -> Index:
-        """The samples that no displacement of the components can move."""
+        """Indices of the samples that no displacement of the components can move."""
         return np.flatnonzero(self.lever == 0.0)
 
     @cached_property
@@ -167,7 +167,7 @@ class ComponentPath:
         return float(np.sqrt(squares.max(initial=0.0)))
 
     def jerk(self, values: Array) -> Array:
-        """Return the third derivative of values at the samples, shape (n, m): six times the divided differences.
+        """Return the third derivative of values (n, m) at the samples, as six times the third divided differences.
 
         Returns:
             Shape (n - 3, m).

@@ -34,8 +34,8 @@ class GoalPosture:
 
     Attributes:
         joints: joint positions, shape (n_joints,) [rad].
-        tilt: rotation vector from the learned rotation of the tool at the goal to its rotation in this posture, in the
-            base frame, shape (3,) [rad].
+        tilt: rotation of the tool in this posture away from its learned rotation at the goal, as a rotation vector in
+            the base frame, shape (3,) [rad].
     """
 
     joints: Array
@@ -47,8 +47,8 @@ class GoalSearch:
     """The result of a search for clear postures at the goal.
 
     Attributes:
-        found: different clear postures, the one nearest to the start of the motion first.
-        best: the largest clearance of all postures at the goal; None if the arm can't reach the goal.
+        found: different clear postures; the posture nearest to the start of the motion is the first.
+        best: the largest clearance among all postures at the goal; None if the arm can't reach the goal.
     """
 
     found: tuple[GoalPosture, ...]
@@ -59,13 +59,13 @@ def clear_postures(around: ArmAmongObstacles, goal: Pose, time: float, start: Ar
     """Search for postures in which the tool is at the goal and the whole arm is clear.
 
     Inverse kinematics from random starts finds postures at the goal. Each posture is then varied by the self-motion of
-    the arm, which does not move the tool. If no posture is clear and ``goal_tilt`` is positive, the same search is made
+    the arm, which does not move the tool. If no posture is clear and ``goal_tilt`` is positive, the search is repeated
     with a tilted tool.
 
     Args:
         around: the arm, its obstacles and the required clearances.
         goal: learned pose of the tool at the goal, tool_to_base.
-        time: time at which the arm is at the goal, for obstacles that move [s].
+        time: time at which the arm is at the goal [s]; moving obstacles are predicted for this time.
         start: posture at the start of the motion, shape (n_joints,) [rad].
         goal_tilt: largest rotation of the tool away from its learned rotation at the goal [rad].
     """

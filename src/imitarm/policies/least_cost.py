@@ -24,23 +24,23 @@ _TIED = 1e-13  # costs that differ by less are equal: it is above the rounding o
 
 
 class Response(NamedTuple):
-    r"""How a deviation from the primitive's motion develops while a coupling acceleration is constant.
+    r"""How a deviation from the motion of a primitive changes over time under a constant coupling acceleration.
 
-    The deviation e = x - xi of a primitive with the coupling acceleration u obeys a linear equation, because the
-    primitive's force depends on the phase only:
+    Let x be the position of the tool, xi the position on the motion primitive, and u the coupling acceleration. The
+    force of the primitive depends only on the phase, so the deviation e = x - xi obeys a linear equation:
 
     .. math::
         \tau^2 \ddot e + D \tau \dot e + K e = \tau^2 u, \qquad
         e(t) = A(t)\,e_0 + B(t)\,\dot e_0 + G(t)\,u, \qquad G = \frac{\tau^2}{K} (1 - A)
 
-    With the roots l_1, l_2 of ``tau^2 l^2 + D tau l + K = 0``, ``A = (l_1 exp(l_2 t) - l_2 exp(l_1 t)) / (l_1 - l_2)``
-    and ``B = (exp(l_1 t) - exp(l_2 t)) / (l_1 - l_2)``. Without u, the deviation returns to 0: the tool returns to the
-    path by itself.
+    Let l_1 and l_2 be the roots of ``tau^2 l^2 + D tau l + K = 0``. Then ``A = (l_1 exp(l_2 t) - l_2 exp(l_1 t)) / (l_1
+    - l_2)`` and ``B = (exp(l_1 t) - exp(l_2 t)) / (l_1 - l_2)``. Without u, the deviation decays to 0, so the tool
+      returns to the path.
 
     Attributes:
-        A: see above, shape (k,).
-        B: shape (k,) [s].
-        G: shape (k,) [s^2].
+        A: factor of the initial deviation, shape (k,).
+        B: factor of the initial velocity of the deviation, shape (k,) [s].
+        G: factor of the coupling acceleration, shape (k,) [s^2].
         a_rate: derivative of A, shape (k,) [1/s].
         b_rate: derivative of B, shape (k,).
         g_rate: derivative of G, shape (k,) [s].
@@ -69,7 +69,7 @@ class Response(NamedTuple):
         return cls(A, B, (1.0 - A) / stiffness, -stiffness * B, A - damping * B, B.copy())
 
     def free(self, deviation: Array) -> Array:
-        """Return the deviations without coupling, shape (k, 3) [m], from ``deviation`` = [e_0; e_0'] (2, 3)."""
+        """Return the deviations (k, 3) [m] that follow from ``deviation`` = [e_0; e_0'] (2, 3) without coupling."""
         return self.A[:, None] * deviation[0] + self.B[:, None] * deviation[1]
 
 
@@ -80,8 +80,8 @@ def allowed_axes(forbidden: Array) -> tuple[Array, Array]:
         forbidden: directions in which the path must not be displaced, unit rows (m, 3).
 
     Returns:
-        An orthonormal basis of the directions that are not forbidden both ways, as columns, shape (3, d), and the
-        remaining forbidden directions in this basis, shape (m', d).
+        An orthonormal basis of the d directions that are permitted at least one way, as columns, shape (3, d); and the
+        directions that are forbidden only one way, in this basis, shape (m', d).
     """
     both = np.any(forbidden @ forbidden.T < -1.0 + 1e-9, axis=1)
     _, size, basis = np.linalg.svd(np.concatenate([np.zeros((1, 3)), forbidden[both]]))
@@ -107,8 +107,8 @@ def headings(axes: Array) -> Array:
 def frame(tangent: Array, axes: Array) -> Array:
     """Return an orthonormal frame (3, d) of the directions ``axes`` (3, d): along the motion, to its left, and up.
 
-    The frame depends on the motion and the vertical only, so a scene that is rotated about the vertical, or mirrored,
-    has the rotated or mirrored candidates.
+    The frame depends only on the motion and the vertical. If a scene is rotated about the vertical, or mirrored, the
+    candidates are rotated or mirrored in the same way.
     """
     if axes.shape[1] == 3:
         return _frame_in_space(*tangent.tolist())
@@ -138,7 +138,7 @@ def _frame_in_space(x: float, y: float, z: float) -> Array:
 
 
 class Prediction(NamedTuple):
-    """The motion without coupling over the horizon, for R speeds of the phase.
+    """The motion without coupling at the H instants of the horizon, for R speeds of the phase.
 
     Attributes:
         centers: centres of the tool's spheres without coupling, shape (R, H, S, 3) [m].
@@ -156,10 +156,10 @@ class Choice(NamedTuple):
 
     Attributes:
         scaled: coupling acceleration u / a_max, shape (3,).
-        rate: speed of the phase, 1 is the learned speed.
-        cost: its cost.
+        rate: speed of the phase; 1 is the learned speed.
+        cost: predicted cost of this candidate.
         nearest: index of the obstacle that comes nearest; -1 if none is near.
-        gap: distance of the tool to this obstacle, less the margin [m].
+        gap: distance of the tool to this obstacle, minus the margin [m].
     """
 
     scaled: Array
@@ -170,7 +170,7 @@ class Choice(NamedTuple):
 
 
 STAY = Choice(np.zeros(3), 1.0, 0.0, -1, math.inf)
-"""The choice where no obstacle is near: the tool returns to its path by itself."""
+"""The choice if no obstacle is near: no coupling acceleration, so the tool returns to its path."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,31 +181,33 @@ class LeastCost:
         J(u, r) = \sum_{m=1}^{H} \gamma^m \left[ \tfrac12 w_e\, e_m^T \Theta e_m + \sum_i b_i(\xi_m + e_m, m) \right]
         + w_\Delta \|\hat u - \hat u_{prev}\|^2 + w_u \|\hat u\|^2 + w_r (1 - r)^2, \qquad \hat u = u / a_{max}
 
-    This is thesis Eq 5.5, corrected: the task cost instead of the trajectory, an obstacle cost b that falls with the
-    distance, and a horizon over which both are summed. The precision Theta is that of the current phase. The candidates
-    are u = 0, and three sizes of u in each heading. The speeds are those of ``rates``: to wait (r = 0) and to go back
-    (r < 0) are candidates like the others.
+    The symbols are explained under Attributes. The formula corrects thesis Eq 5.5 in three points. It sums a task cost
+    of the deviations e, where the thesis has the trajectory itself. The cost b of an obstacle decreases with the
+    distance. Both costs are summed over a horizon of H instants. Theta is the precision at the current phase. The
+    candidates for u are 0 and three sizes of u in each heading. The candidates for r are the speeds in ``rates``, which
+    include waiting (r = 0) and going back (r < 0).
 
-    The result is the least cost of all candidates at all speeds, but few distances are computed. No candidate costs
-    less than its cost without the obstacles, and an obstacle that the tool can't reach until an instant costs nothing
-    there.
+    The search finds the least cost of all candidates at all speeds, but computes only few distances. Two facts make
+    this possible: a candidate costs at least as much as it would without obstacles, and an obstacle has no cost at an
+    instant before the tool can reach it.
 
     The cost of an obstacle falls gradually, so an obstacle beside the goal would keep the tool away from the goal.
-    After the phase has ended, b is therefore reduced by its value at the goal, if the goal keeps the clearance.
+    Therefore, after the end of the phase, b is reduced by its value at the goal, provided that the goal keeps the
+    clearance.
 
     Attributes:
         times: instants of the horizon, shape (H,) [s].
         gains: stiffness and damping of the deviation.
-        time_constant: tau of the deviation [s].
-        obstacle_cost: b.
-        max_acceleration: a_max [m/s^2].
+        time_constant: tau, the time constant of the deviation [s].
+        obstacle_cost: b, the cost of being near an obstacle.
+        max_acceleration: a_max, the largest coupling acceleration [m/s^2].
         units: headings in the frame of :func:`frame`, shape (k, d).
-        discount: gamma.
-        deviation_weight: w_e [1/m^2].
-        change_weight: w_Delta.
-        size_weight: w_u.
-        wait_weight: w_r.
-        rates: speeds of the phase; the first one is 1.
+        discount: gamma, the factor by which the weight decreases from one instant to the next.
+        deviation_weight: w_e, weight of the deviation [1/m^2].
+        change_weight: w_Delta, weight of a change of u since the last step.
+        size_weight: w_u, weight of the size of u.
+        wait_weight: w_r, weight of the difference between r and the learned speed 1.
+        rates: speeds of the phase that are candidates; the first speed is 1.
         sizes: sizes of u, as fractions of a_max.
     """
 
@@ -258,17 +260,17 @@ class LeastCost:
 
     @property
     def travel(self) -> float:
-        """Largest deviation within the horizon because of u [m]."""
+        """Largest deviation that u can cause within the horizon [m]."""
         return float(self._gains[-1])
 
     def smooth_costs(self, scaled: Array, sizes: Array, previous: Array, free: Array, precision: Array) -> Array:
-        """Return the costs of C candidates without those of obstacles and waiting, shape (C,).
+        """Return the costs of C candidates, without the costs of obstacles and of waiting, shape (C,).
 
         The task cost is a quadratic form in u, so the deviations of the candidates are not needed.
 
         Args:
             scaled: u / a_max of the candidates, shape (C, 3).
-            sizes: cost of their sizes, shape (C,).
+            sizes: cost of the size of each candidate, shape (C,).
             previous: u / a_max of the last choice, shape (3,).
             free: deviations without coupling, shape (H, 3) [m].
             precision: Theta, shape (3, 3).
@@ -296,11 +298,11 @@ class LeastCost:
 
         Args:
             axes: frame of the motion, shape (3, d).
-            one_sided: directions in which u must have no component, shape (m, 3).
+            one_sided: directions along which u must have no positive component, shape (m, 3).
             previous: u / a_max of the last choice, shape (3,).
             free: deviations without coupling, shape (H, 3) [m].
             precision: Theta at the current phase, shape (3, 3).
-            predict: returns the motion without coupling for speeds of the phase, shape (R,).
+            predict: function that takes speeds of the phase (R,) and returns the motion without coupling.
             obstacles: the obstacles that may come near.
         """
         scaled, sizes = self._candidates

@@ -1,10 +1,10 @@
-"""The smallest displacement of components that keeps the clearance, when the side of each obstacle is given.
+"""The smallest displacement of components that keeps the clearance and passes each obstacle on a given side.
 
-With one tangent plane for each sample and obstacle, "keep the clearance" is a set of linear inequalities in the
-displacements. Because the planes under-estimate the distance, each solution truly keeps the clearance at the samples
-(an inner convex approximation). The method therefore alternates two steps: it minimises ``sum_k Delta_k^T Y_k^-1
-Delta_k`` under these inequalities, then computes new planes. Each solution stays in the feasible set, and the cost
-never increases.
+A tangent plane for each sample and obstacle turns the required clearance into linear inequalities in the displacements
+``Delta_k`` of the components. The planes never overestimate the distance, so each solution keeps the clearance at the
+samples (an inner convex approximation). The method alternates two steps: it minimises ``sum_k Delta_k^T Y_k^-1
+Delta_k`` under these inequalities, then computes new planes. ``Y_k`` is the demonstrated covariance of component k.
+Each solution also satisfies the inequalities of the new planes, so the cost never increases.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _SOLVED = 1  # daqp's exit flag of an optimal solution
 
 
 def least_norm(rows: Array, lower: Array, upper: Array) -> Array | None:
-    """Solve ``min |y|^2`` under ``lower <= rows @ y <= upper`` by an exact active-set method (daqp).
+    """Minimise ``|y|^2`` under ``lower <= rows @ y <= upper`` with an exact active-set method (daqp).
 
     Args:
         rows: coefficients of the inequalities, shape (m, n).
@@ -70,7 +70,7 @@ class AllowedDirections:
         forbidden: forbidden directions, one unit vector per row, shape (m, 3). Forbidding a direction and its opposite
             forbids the whole axis.
         axes: orthonormal basis of the space without the forbidden axes, as columns, shape (3, d).
-        one_sided: the remaining forbidden directions, one unit vector per row, in the basis ``axes``, shape (m', d).
+        one_sided: directions that are forbidden only one way, as unit vectors in the basis ``axes``, shape (m', d).
     """
 
     forbidden: Array
@@ -79,7 +79,7 @@ class AllowedDirections:
 
     @classmethod
     def without(cls, forbidden: Array) -> AllowedDirections:
-        """Build from forbidden directions, unit rows (m, 3).
+        """Build the allowed directions from forbidden directions, one unit vector per row, shape (m, 3).
 
         The latest results are cached, because many scenes forbid the same directions.
         """
@@ -101,9 +101,9 @@ class AllowedDirections:
         return self.axes.shape[1]
 
     def enforced(self, reduced: Array) -> Array:
-        """Return the displacements (..., 3) with the coordinates (..., d) in the basis ``axes``.
+        """Return the displacements (..., 3) that have the coordinates (..., d) in the basis ``axes``.
 
-        Rounding errors may leave a small part in forbidden directions.
+        Because of rounding errors, a small component may remain in forbidden directions.
         """
         for _ in range(100 if len(self.one_sided) else 0):  # taking out one part may bring back a little of another
             for f in self.one_sided:
@@ -113,7 +113,7 @@ class AllowedDirections:
         return np.asarray(reduced @ self.axes.T)
 
     def projected(self, vectors: Array) -> Array:
-        """Return vectors (..., 3) without their parts along those axes on which the path may not be displaced."""
+        """Return vectors (..., 3) without their components along axes on which the path must not be displaced."""
         return vectors @ self.axes @ self.axes.T
 
     def unit_directions(self, candidates: Array) -> Array:
@@ -166,7 +166,8 @@ class Detour:
         feasible: whether every bound reaches the required clearance and the path is within ``MAX_DISPLACEMENT`` and
             ``MAX_STEP_RATIO``.
         out_of_limits: whether the path exceeds ``MAX_DISPLACEMENT`` or ``MAX_STEP_RATIO``.
-        close: points of the path that are too close to an obstacle although the samples before and after them are not.
+        close: points of the path that are too close to an obstacle, although the neighbouring samples keep the
+            clearance.
     """
 
     path: ComponentPath
@@ -269,15 +270,15 @@ class LeastDetour:
 
         If no attempt is feasible, the best attempt is returned; None if there was no attempt.
 
-        Where a segment is too close to an obstacle although the samples at its ends are not, the closest point of the
-        segment adds an inequality. A larger required clearance at the samples would not help, for two reasons. First,
-        a path around an edge can move its samples away from the edge and still cut the edge, if its steps become
-        longer. Second, components can hardly move samples near a time at which the path is fixed, so a little more
-        distance there needs very large displacements of the components.
+        If a segment is too close to an obstacle although the samples at its ends are not, the closest point of the
+        segment gives an additional inequality. A larger required clearance at the samples would not help, for two
+        reasons. First, if a path around an edge moves its samples away from the edge, its steps become longer, and a
+        step may still cut the edge. Second, near a time at which the path is fixed, components can hardly move samples.
+        A little more distance there needs very large displacements of the components.
 
         Args:
-            start: clearance along the path at which the first tangents are taken. It may be a path
-                that no displacement of the components produces.
+            start: clearance along the path at which the first tangents are taken. No displacement of the components
+                needs to produce this path.
             moved: indices of the components that may move; None: all.
             smoothness: weight of the squared jerk; None: the default weight of this path.
         """
@@ -401,10 +402,10 @@ class LeastDetour:
 
 
 def style_scale(path: ComponentPath, allowed: AllowedDirections, moved: Index, smoothness: float) -> Array:
-    """Return the matrix G (m d, m d) with ``delta = G y``, so that the cost of ``delta`` is ``|y|^2``.
+    """Return the matrix G (m d, m d) that takes coordinates y to displacements ``delta = G y`` with the cost ``|y|^2``.
 
-    The cost is ``delta^T H delta``. The matrix H is the sum of two terms: the demonstrated precisions, on the diagonal
-    blocks, and the squared jerk of the displacement.
+    The cost is ``delta^T H delta``. The matrix H is the sum of two matrices. The first has the demonstrated precisions
+    as diagonal blocks; the second gives the squared jerk of the displacement.
 
     Args:
         path: the path and its components.
@@ -436,7 +437,7 @@ class AvoidanceProblem:
 
     Attributes:
         path: the nominal path and its components.
-        nominal: clearance of the tool along the nominal path, to every obstacle.
+        nominal: distances from the tool to every obstacle along the nominal path.
         clearance: required [m].
         allowed: directions in which components may move.
     """
@@ -472,8 +473,8 @@ class PathAdapter(ABC):
 def best_of(detours: Iterable[Detour | None]) -> Detour | None:
     """Return the best detour; None when there is none.
 
-    Feasible detours come before detours that are only within the limits, and these come before all others. Within each
-    group, the detour with the largest clearance is the best.
+    Feasible detours rank first. Detours that are only within the limits rank second, and all other detours last. Within
+    each group, the detour with the largest clearance is the best.
     """
     found = [detour for detour in detours if detour is not None]
     return max(found, key=lambda x: (x.feasible, not x.out_of_limits, x.lowest), default=None)

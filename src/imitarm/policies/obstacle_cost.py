@@ -25,9 +25,9 @@ class PredictedObstacles(NamedTuple):
     """Obstacles, predicted at the instants of the horizon.
 
     Attributes:
-        packed: n obstacles as observed.
-        times: instants, after the time of the observation, shape (H,) [s].
-        margin: additional distance to each obstacle at each instant, shape (n, H) [m].
+        packed: the n observed obstacles.
+        times: time of each instant since the observation, shape (H,) [s].
+        margin: additional distance required to each obstacle at each instant, shape (n, H) [m].
     """
 
     packed: PackedObstacles
@@ -36,7 +36,7 @@ class PredictedObstacles(NamedTuple):
 
 
 class Groups(NamedTuple):
-    """Pairs of an obstacle and a sphere of the tool, each at one instant; candidates are compared within a pair.
+    """Pairs of an obstacle and a sphere of the tool, each at one instant.
 
     Attributes:
         obstacle: index of the obstacle, shape (k,).
@@ -51,7 +51,7 @@ class Groups(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ObstacleCost(ABC):
-    """Cost of a tool, made of spheres, near obstacles.
+    """Cost of the nearness of a tool to obstacles; spheres represent the tool.
 
     Attributes:
         clearance: required distance of the tool to every obstacle [m].
@@ -66,7 +66,7 @@ class ObstacleCost(ABC):
         """Return the distances between tool and obstacles beyond which the cost is negligible, shape (n,) [m]."""
 
     def gaps(self, obstacles: PredictedObstacles, groups: Groups, origins: Array, scales: Array, moves: Array) -> Array:
-        """Return the distances between the spheres and the obstacles, less the margin, shape (k, C) [m].
+        """Return the distances between spheres and obstacles, minus the margin, for C candidates, shape (k, C) [m].
 
         In candidate c, the centre of the sphere of pair k is ``origins[k] + scales[k] moves[c]``.
 
@@ -74,8 +74,8 @@ class ObstacleCost(ABC):
             obstacles: n obstacles at H instants.
             groups: k pairs.
             origins: centres of the spheres, shape (k, 3) [m].
-            scales: shape (k,) [m].
-            moves: displacements of the candidates, shape (C, 3).
+            scales: factor of the candidates' displacements for each pair, shape (k,) [m].
+            moves: displacements of the candidates in units of ``scales``, shape (C, 3).
         """
         times = obstacles.times[groups.instant]
         gaps = displaced_distances(obstacles.packed, groups.obstacle, times, origins, scales, moves)
@@ -92,7 +92,7 @@ class ObstacleCost(ABC):
         moves: Array,
         gaps: Array,
     ) -> Array:
-        """Return the cost of each pair, shape (k, C).
+        """Return the cost of each pair for each candidate, shape (k, C).
 
         The cost of a tool of several spheres is the largest cost of its spheres.
 
@@ -112,7 +112,7 @@ class ObstacleCost(ABC):
 
 @dataclass(frozen=True, eq=False)
 class DistanceCost(ObstacleCost):
-    r"""Cost by the signed distance, for any convex shape.
+    r"""Cost that depends on the signed distance, for any convex shape.
 
     .. math:: b = \exp(-(gap - d_{safe}) / w), \qquad gap = sd(\chi) - r - margin
 
@@ -158,7 +158,7 @@ class DistanceCost(ObstacleCost):
 
 @dataclass(frozen=True, eq=False)
 class GaussianCost(ObstacleCost):
-    r"""Cost by a Gaussian about the obstacle's centre, as in the thesis, averaged over the tracker's uncertainty.
+    r"""Gaussian cost about the obstacle's centre, as in the thesis; its mean over the tracker's uncertainty is used.
 
     .. math::
         b &= \alpha\,|L|^{1/2} |L + P|^{-1/2}
@@ -167,15 +167,16 @@ class GaussianCost(ObstacleCost):
         L &= R\,\mathrm{diag}(\ell_j^2)\,R^T, \qquad \ell_j = \tfrac12 (a_j + r + d_{safe})
 
     Here ``a_j`` are the obstacle's semi-axes, ``r`` is the radius of a sphere of the tool and ``P`` is the covariance
-    of the predicted position. The mean over P is the closed form of the sample mean in thesis Eq 5.5, whose exponent
-    lacks its minus sign.
+    of the predicted position. The thesis computes a mean over samples (Eq 5.5, whose exponent lacks its minus sign);
+    the formula above is the exact mean over the covariance P.
 
-    The height is ``alpha = 2 k l^2 e^2``, with the least of the lengths l and the task's cost ``k |e|^2 / 2`` of a
-    deviation e during the whole horizon. At the required clearance, which is the distance 2 l, the cost of one instant
-    is then that of a deviation of 2 l, which leads around the obstacle, during the whole horizon.
+    The height of the Gaussian is ``alpha = 2 k l^2 exp(2)``, where l is the least of the three lengths. A deviation d
+    of the tool during the whole horizon has the task cost ``k |d|^2 / 2``. At the distance 2 l from the obstacle's
+    centre, the tool has exactly the required clearance. At this distance, the obstacle's cost of one instant equals the
+    task cost of a deviation of 2 l, with which the tool gets around the obstacle.
 
     Attributes:
-        stiffness: k [1/m^2].
+        stiffness: k, twice the task cost of a unit deviation during the whole horizon [1/m^2].
     """
 
     stiffness: float = 1.0

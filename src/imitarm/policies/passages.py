@@ -1,12 +1,13 @@
-"""Passages between obstacles: a grid of positions that proves that there is none, or shows where one may be.
+"""Passages between obstacles: a grid of positions that shows where a passage may be, or proves that none exists.
 
 The grid covers all positions that the path may reach, and is aligned with an obstacle. A cell is blocked if all its
 corners are inside one inflated obstacle. The inflated obstacle is convex, so the whole cell is then inside. If no chain
 of cells that are not blocked joins the fixed points of the path, there is no path, and no further search is necessary.
-Otherwise, the chain of least cost is a proposal for a path that leads where no straight ray from the nominal path does,
-for example back out of a shelf.
+Otherwise, the chain of least cost proposes a path. This path may lead to places that no straight ray from the nominal
+path reaches, for example back out of a shelf.
 
-The grid does not depend on time. It is used only where nothing moves but the tip, with the largest sphere at the tip.
+The grid does not depend on time. It is used only if the obstacles are at rest and the tool does not rotate about its
+tip. The largest sphere at the tip then represents the tool.
 """
 
 from __future__ import annotations
@@ -38,13 +39,13 @@ _STEADY = 4.0  # weight of squared steps beside squared displacements
 
 
 class Passages:
-    """The grid among one set of obstacles.
+    """The grid of positions among one set of obstacles.
 
     Args:
         path: the nominal path and its components.
         tool: the tool and the obstacles.
         clearance: required [m].
-        allowed: directions in which components may move; at least two dimensions.
+        allowed: directions in which components may move; they must span at least two dimensions.
     """
 
     def __init__(
@@ -130,7 +131,7 @@ class Passages:
 
     @cached_property
     def are_closed(self) -> bool:
-        """Whether there is provably no path."""
+        """Whether the grid proves that no path exists."""
         if not self._obstacles:
             return False
         labels, _ = ndimage.label(~self._blocked, structure=np.ones((3,) * self._d))
@@ -138,7 +139,7 @@ class Passages:
         return bool(met.min() == 0 or np.ptp(met) > 0)
 
     def route(self) -> Array | None:
-        """Return the chain of least cost, as displacements of the tip at all samples (n, 3) [m]; None if there is none.
+        """Return the chain of least cost as displacements of the tip at all samples (n, 3) [m]; None without a chain.
 
         The chain may lead a little too close to obstacles.
         """

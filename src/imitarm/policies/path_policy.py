@@ -42,10 +42,11 @@ class PathPlan:
     Attributes:
         trajectory: path of the tool with times, n samples. Without quaternions, the tool keeps its rotation.
         displaced: distance of each sample from the learned path, shape (n,) [m].
-        joints: joint positions of the arm at the samples, shape (n, n_joints) [rad], linear between them; None if only
-            the tool was planned.
+        joints: joint positions of the arm at the samples, shape (n, n_joints) [rad]; the joints move linearly between
+            the samples. None if only the tool was planned.
         only_on_schedule: whether the plan is valid only at the planned times, because an obstacle moves.
-        adaptation: the result of :func:`~imitarm.policies.adapt`, for reports; None if the method computes none.
+        adaptation: the result of :func:`~imitarm.policies.adapt`, for reports; None if the method computes no
+            adaptation.
     """
 
     trajectory: Trajectory
@@ -56,7 +57,7 @@ class PathPlan:
 
     @classmethod
     def beside(cls, nominal: Trajectory, trajectory: Trajectory) -> Self:
-        """Return the plan for a path of the tool; its displacement is measured from ``nominal`` at equal phases."""
+        """Return the plan for a path of the tool; ``displaced`` is its distance from ``nominal`` at equal phases."""
         phase = (trajectory.times - trajectory.times[0]) / trajectory.duration
         learned, _ = nominal.at(nominal.times[0] + phase * nominal.duration)
         return cls(trajectory, np.linalg.norm(trajectory.positions - learned, axis=1))
@@ -87,25 +88,27 @@ class PathPolicy(Policy):
 
         twist = r v_d(s) + K [p_d(s) - p; log(R_d(s) R^T)],     ds/dt = r = max(0, 1 - (|p_d - p| / e_0)^2)
 
-    The phase ``s`` therefore waits for a robot that lags, for example at its speed limits or when a hand holds it. A
-    robot that has left the path returns to it along the straight line from the tool to its target. The tool and its
-    target are both clear of obstacles, and each point of the line is within ``e_0 / 2`` of the tool or of the target.
-    If ``e_0`` is the required clearance, the line therefore cuts a corner by at most half of the clearance.
+    Here, ``p`` and ``R`` are the measured position and rotation of the tool, and the index d marks their desired
+    values. The phase ``s`` slows down if the robot lags behind, for example because of its speed limits or because a
+    hand holds it. A robot that has left the path returns along the straight line from the tool to its target on the
+    path. The tool and its target both keep the clearance. While the phase moves, each point of the line is within ``e_0
+    / 2`` of the tool or of the target. If ``e_0`` is the required clearance, the line therefore reduces the clearance
+    by at most half.
 
-    Among moving obstacles a plan may be valid only at the planned times. The phase then follows the clock and does not
-    wait. When the tool is farther than ``e_0 / 2`` from its planned position, such a plan is no longer valid: the arm
-    brakes and stays at rest.
+    Among moving obstacles, a plan may be valid only at the planned times. The phase of such a plan follows the clock
+    and does not wait. If the tool is farther than ``e_0 / 2`` from its planned position, the plan is no longer valid.
+    The arm then brakes and stays at rest.
 
     Args:
         skill: skill to reproduce.
-        gain: K [1/s].
+        gain: K, the feedback gain of position and rotation [1/s].
         patience: e_0, the position error at which the phase stops [m]; None: the clearance, at least 5 mm.
         arrival: the motion has arrived when the tool is nearer than this to the end of the path [m].
         options: arguments of :class:`~imitarm.policies.Policy`.
 
     Attributes:
-        search_space: options of the constructor that a benchmark may tune: name -> (lowest, highest) value, searched on
-            a logarithmic scale.
+        search_space: options of the constructor that a benchmark may tune, each with its lowest and highest value. The
+            values are searched on a logarithmic scale.
         motion: the plan of the last ``reset``.
     """
 
@@ -136,19 +139,20 @@ class PathPolicy(Policy):
         """Plan the whole motion in a scene.
 
         Args:
-            scene: goal (None: the learned one) and obstacles at the time at which the motion begins.
+            scene: goal and obstacles at the time at which the motion begins; if the goal is None, the learned goal is
+                used.
             start: pose of the tool at the start; None: the learned start.
             state: measured state of the arm, for methods that plan its joints.
 
         Raises:
-            InfeasibleError: when the method knows that it has no solution; the message says why.
+            InfeasibleError: when the method finds that no solution exists; the message gives the reason.
         """
 
     def reset(self, observation: Observation) -> None:
         """Plan the path in the observed scene, starting at the measured pose of the tool.
 
         Raises:
-            InfeasibleError: when the method knows that it has no solution; the message says why.
+            InfeasibleError: when the method finds that no solution exists; the message gives the reason.
         """
         start = self.start_of(observation)
         self.motion = None
@@ -166,7 +170,7 @@ class PathPolicy(Policy):
         self._phase, self._void = 0.0, ""
 
     def start_of(self, observation: Observation) -> Pose | None:
-        """Return the measured pose of the tool; None if it is the learned start."""
+        """Return the measured pose of the tool, or None if this pose is the learned start."""
         away = observation.tool_to_base.error_to(self.skill.start_)
         if not self.skill.gmr_.has_orientation_:
             away = away[:3]
@@ -174,7 +178,7 @@ class PathPolicy(Policy):
 
     @property
     def plan(self) -> Adaptation | None:
-        """The result of the last adaptation, for drawing in a report; None if the method computes none."""
+        """The result of the last adaptation, which reports draw; None if the method computes no adaptation."""
         return None if self.motion is None else self.motion.adaptation
 
     @property

@@ -1,16 +1,19 @@
 r"""PlanInExecution: a certified plan that an arm follows on time, and the check that its assumptions still hold.
 
-The certificate of a plan assumes that the arm is on schedule, and that each obstacle i is within its margin of where
-the plan predicted it. With the certified clearance :math:`c_0 \ge c`, an obstacle may be farther away from there:
+The certificate of a plan assumes that the arm is on schedule, and that each obstacle i is within its margin :math:`m_i`
+of its predicted position. If the certified clearance :math:`c_0` exceeds the required clearance c, the obstacle may
+even leave its margin.
+It is sufficient that the following inequality holds:
 
 .. math:: |p_i(t) - \hat p_i(t)| + r_i \, |\theta_i(t)| + s_i(t) \le m_i(t) + c_0 - c
 
-Here :math:`p_i` is the position as seen now, :math:`\hat p_i` the position that the plan predicted for now,
-:math:`r_i` the radius of a sphere that contains the obstacle, :math:`\theta_i` the angle between the seen and the
-predicted rotation, and :math:`s_i` the growth of the largest size since then. Then the distance is still at least c.
+Here, :math:`p_i` is the observed position of the obstacle, and :math:`\hat p_i` is the position that the plan predicted
+for this time. :math:`r_i` is the radius of a sphere that contains the obstacle. :math:`\theta_i` is the angle between
+the observed and the predicted rotation, and :math:`s_i` is the growth of the obstacle's largest size since the plan was
+made. If the inequality holds, the distance to the obstacle is at least c.
 
-Where this does not hold, the rest of the plan may still be clear of the obstacles as they are seen now. The certificate
-is then made again for the same motion, which takes a fraction of the time of planning.
+If the inequality does not hold, the rest of the plan may still be clear of the observed obstacles. A new certificate is
+then computed for the same motion, which takes a fraction of the time of planning.
 """
 
 from __future__ import annotations
@@ -40,20 +43,21 @@ _DISPLACED = 1e-3  # [m] from the learned path: less is not called avoiding
 
 @dataclass(frozen=True, eq=False)
 class PlanInExecution:
-    """A certified plan of the whole arm, and when it began.
+    """A certified plan of the whole arm, and the time at which its execution began.
 
     Attributes:
         adaptation: the plan.
-        began: time of its first sample [s].
+        began: time at which the execution of the plan began [s].
         offset: time in the learned motion at which the plan begins [s].
         scene: the obstacles that the certificate assumes, at the time ``seen``.
         seen: the time from which the certificate holds [s].
-        margins: the margin of each of these obstacles from this time on; None for an obstacle without one.
+        margins: for each of these obstacles, its margin from the time ``seen`` on, or None for an obstacle without a
+            margin.
         clearance: required clearance [m].
         certified: certified clearance [m].
         approach: duration of the motion to the first posture of the path [s]; it is part of the plan.
         trajectory: the tool's path of the whole motion, from time 0.
-        joints: the joint positions at its samples, shape (n, n_joints) [rad].
+        joints: the joint positions at the samples of ``trajectory``, shape (n, n_joints) [rad].
     """
 
     adaptation: Adaptation
@@ -115,7 +119,7 @@ class PlanInExecution:
         return _at(time - self.began, self.trajectory.times, self._velocities)
 
     def phase_at(self, time: float) -> float:
-        """Return the phase at a time [s], as :func:`~imitarm.policies.replan` counts it [s]."""
+        """Return the phase at a time [s]: the time since the approach ended [s]."""
         return max(time - self.began - self.approach, 0.0)
 
     def learned_at(self, time: float) -> float:
@@ -136,18 +140,18 @@ class PlanInExecution:
         return bool(phase < done[-1] and learned[i] - learned[i - 1] < _STANDS * (done[i] - done[i - 1]))
 
     def displacement_at(self, time: float) -> float:
-        """Return the distance of the planned path from the learned path at a time [s], 0 if it is negligible [m]."""
+        """Return the distance [m] of the planned path from the learned path at a time [s]; 0 if it is below 1 mm."""
         plan = self.adaptation
         away = np.linalg.norm(plan.trajectory.positions - plan.nominal.positions, axis=1)
         displaced = float(np.interp(self.phase_at(time), plan.trajectory.times, away))
         return displaced if displaced > _DISPLACED else 0.0
 
     def off_schedule(self, arm: ArmModel, time: float, state: ArmState, tool: Pose, patience: float) -> str:
-        """Return why the arm is not on schedule; empty if it is.
+        """Return a text that says why the arm is not on schedule; empty if the arm is on schedule.
 
         Args:
             arm: the arm.
-            time: now [s].
+            time: the current time [s].
             state: measured state of the arm.
             tool: measured pose of the tool.
             patience: accepted error of the tool's position [m].
@@ -158,7 +162,7 @@ class PlanInExecution:
         return ""
 
     def unforeseen(self, scene: Scene) -> str:
-        """Return how the obstacles differ from what the plan assumed; empty if the certificate holds for them.
+        """Return a text that says how the obstacles differ from the plan's assumption; empty if the certificate holds.
 
         Args:
             scene: the obstacles as seen now; its stamp is now.
@@ -190,13 +194,13 @@ class PlanInExecution:
     def certified_again(
         self, arm: ArmModel, scene: Scene, margins: Sequence[PredictionMargin | None], hold: float
     ) -> PlanInExecution | None:
-        """Return the same plan with a certificate for the obstacles as seen now; None if the rest is not clear of them.
+        """Return the same plan with a new certificate for the observed obstacles; None if the rest is not clear.
 
         Args:
             arm: the arm.
             scene: the obstacles as seen now; its stamp is now.
-            margins: the margin of each of them from now on; None for an obstacle without one.
-            hold: time after the arrival for which the arm must be clear at the goal [s].
+            margins: for each of these obstacles, its margin from now on, or None for an obstacle without a margin.
+            hold: the arm must keep its clearances at the goal for this long after the arrival [s].
         """
         now, times = scene.stamp, self.trajectory.times + self.began
         later = times > now

@@ -50,18 +50,18 @@ class Observation:
 class Policy(ABC):
     """Decides the next command from the current observation.
 
-    To write your own policy, implement the three methods below in one subclass. Register the policy under the entry
-    point group ``imitarm.policies``, or by ``POLICIES.register(name, policy)``. The policy then appears in ``imitarm
-    reproduce --policy``, in ``imitarm benchmark placements`` and in their reports. These commands construct the policy
-    with the arguments below. The state of a policy lasts from :meth:`reset` to the end of one reproduction; the same
-    observations give the same commands.
+    To write your own policy, implement the methods :meth:`reset`, :meth:`step` and :meth:`finished` in a subclass.
+    Register the policy under the entry point group ``imitarm.policies``, or by ``POLICIES.register(name, policy)``. The
+    policy then appears in ``imitarm reproduce --policy``, in ``imitarm benchmark placements`` and in their reports.
+    These commands construct the policy with the arguments below. The state of a policy lasts from :meth:`reset` to the
+    end of one reproduction; the same observations give the same commands.
 
     Args:
         skill: the skill to reproduce.
         tool_spheres: spheres that contain the tool, rows x y z r in the tool's frame, shape (m, 4) [m]; None: its tip.
         clearance: required distance of the tool to every obstacle [m].
         forbidden: directions in which the motion must not leave the learned path, shape (m, 3).
-        arm: the arm that will move, for policies that plan its joints; None: not known.
+        arm: the arm that will move, for policies that plan its joint motion; None: the arm is not known.
 
     Attributes:
         plan: plan to draw in a report, an :class:`~imitarm.policies.Adaptation`; None if the policy has no plan.
@@ -90,11 +90,11 @@ class Policy(ABC):
     def build(cls, skill: Skill, **options: Any) -> Self:
         """Return a policy, built from the arguments that the command line and the benchmark give to every policy.
 
-        Options about the arm and pinned times are left out if the constructors of the class and its bases do not take
-        them.
+        If the constructors of the class and of its base classes do not take the options about the arm or pinned times,
+        these options are left out.
 
         Raises:
-            InputError: when the constructor does not take the other arguments.
+            InputError: when the constructor does not take one of the other options.
         """
         known = _parameters(cls)
         options = {name: value for name, value in options.items() if name in known or name not in _NEED_NOT_HAVE}
@@ -111,7 +111,8 @@ class Policy(ABC):
         """Start a reproduction in the observed scene.
 
         Raises:
-            InfeasibleError: when the policy knows in advance that the reproduction is impossible; the message says why.
+            InfeasibleError: when the policy finds in advance that the reproduction is impossible; the message gives the
+                reason.
         """
 
     @abstractmethod

@@ -1,17 +1,18 @@
-r"""The distance that a plan keeps in addition to its clearance, because the motion of an obstacle is only predicted.
+r"""The additional distance that a plan keeps to an obstacle whose motion is only predicted.
 
 The error of a prediction grows with the time :math:`\tau` since the obstacle was seen. A
-:class:`~imitarm.perception.CoverageMargin` bounds the error by :math:`m(\tau) = a + b\,\tau`, with a stated
-probability for all :math:`\tau` up to the horizon for which it was calibrated. A plan keeps at each time t
+:class:`~imitarm.perception.CoverageMargin` bounds this error by :math:`m(\tau) = a + b\,\tau`. With a stated
+probability, the bound holds for all :math:`\tau` up to the calibrated horizon. At each time t, a plan keeps the
+distance
 
 .. math:: d_i(t) \ge c + m_i(t), \qquad m_i(t) = a + b \min(t + \tau_i, T) .
 
-Here :math:`d_i` is the distance to the predicted obstacle i, c the clearance, :math:`\tau_i` the age of the estimate at
-time 0, and T the horizon, beyond which the margin no longer grows. As long as the prediction is wrong by at most
-:math:`m_i`, the distance to the true obstacle is at least c.
+Here, :math:`d_i` is the distance to the predicted obstacle i, and c is the required clearance. :math:`\tau_i` is the
+age of the obstacle's estimate at time 0. T is the horizon, after which the margin no longer grows. As long as the
+prediction is wrong by at most :math:`m_i`, the distance to the true obstacle is at least c.
 
-The function :math:`m_i` is concave, so :math:`d_i - m_i` is a convex function of the time on a straight segment of the
-path, as :math:`d_i` is. The certificates therefore hold for :math:`d_i - m_i` without change, with the slopes of
+The function :math:`m_i` is concave, so on a straight segment of the path, :math:`d_i - m_i` is a convex function of
+time, like :math:`d_i` itself. The certificates therefore also hold for :math:`d_i - m_i`; they use the slopes of
 :math:`m_i` on the two sides of a sample.
 """
 
@@ -60,15 +61,15 @@ class PredictionMargin:
 def margins_in(
     scene: Scene, margin: CoverageMargin | None, margin_horizon: float | None
 ) -> tuple[PredictionMargin | None, ...]:
-    """Return the margin of each obstacle of a scene; None for an obstacle whose place is known.
+    """Return, for each obstacle of a scene, its margin, or None if its position is known exactly.
 
-    A margin applies to an obstacle that a tracker estimates (with a ``track_id`` or a ``covariance``), and to one that
-    moves. The scene states where all others are.
+    An obstacle has a margin if it moves, or if a tracker estimates it (it has a ``track_id`` or a ``covariance``). The
+    scene gives the exact position of every other obstacle.
 
     Args:
         scene: obstacles at the time at which a plan begins. ``scene.packed.stamps`` says when each was seen.
-        margin: bound of the error of predictions; None: predictions are exact.
-        margin_horizon: time since an obstacle was seen after which the margin does not grow [s]; None: it always grows.
+        margin: bound of the prediction error; None: predictions are exact.
+        margin_horizon: the margin grows until this time after the obstacle was seen [s]; None: it grows without end.
 
     Raises:
         InputError: when an argument is not valid.
@@ -89,5 +90,5 @@ def margins_in(
 
 
 def is_predicted(obstacle: Obstacle) -> bool:
-    """Return whether the place of an obstacle is only estimated, because it was tracked or because it moves."""
+    """Return whether the position of an obstacle is only estimated, because it was tracked or because it moves."""
     return obstacle.track_id is not None or obstacle.covariance is not None or obstacle.moves

@@ -23,17 +23,18 @@ _UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 @dataclass(frozen=True, eq=False)
 class PrimitivePath:
-    r"""The motion xi(s) of a primitive over the phase s, from 0 at the start to 1 at the goal.
+    r"""The motion xi(s) of a motion primitive; the phase s runs from 0 at the start to 1 at the goal.
 
-    The motion depends on the goal g linearly: if the goal moves by delta, the motion moves by ``p(s) delta``, with the
-    fraction p of the path that has been travelled. A moving goal therefore costs no new integration.
+    The motion depends on the goal g linearly: if the goal moves by delta, the motion moves by ``p(s) delta``, where p
+        is the fraction of the path that has been travelled. If the goal moves, the motion therefore need not be
+        integrated again.
 
     Attributes:
         duration: duration of the motion [s].
-        goal: tool_to_base at the end of the motion.
+        goal: pose of the tool (tool_to_base) at the end of the motion.
         positions: xi at n + 1 equally spaced phases, shape (n + 1, 3) [m].
-        progress: p, shape (n + 1,).
-        precision: Theta of :func:`learned_precision`, shape (n + 1, 3, 3).
+        progress: p, the travelled fraction of the path at each phase, shape (n + 1,).
+        precision: the matrices Theta of :func:`learned_precision`, shape (n + 1, 3, 3).
         quaternions: learned rotations wxyz, shape (n + 1, 4); None when no rotation was learned.
     """
 
@@ -90,11 +91,11 @@ class PrimitivePath:
         return np.diff(self.positions, axis=0)
 
     def nearest(self, phases: Array) -> NDArray[np.intp]:
-        """Return the indices of the nearest samples, same shape."""
+        """Return the index of the sample nearest to each phase; the result has the shape of ``phases``."""
         return np.rint(np.minimum(np.maximum(phases, 0.0), 1.0) * N_SAMPLES).astype(np.intp)
 
     def tangent(self, phase: float) -> Array:
-        """Return the direction of the motion (3,): that to the goal where the motion rests; 0 at the goal."""
+        """Return the direction of the motion (3,); where the motion rests, the direction to the goal; 0 at the goal."""
         i = min(int(phase * N_SAMPLES), N_SAMPLES - 1)
         along = self._steps[i]
         length = float(np.sqrt(along.dot(along)))
@@ -125,14 +126,14 @@ class PrimitivePath:
 
 
 def learned_precision(skill: Skill) -> Array:
-    r"""Return how precise the motion must be, at n + 1 equally spaced phases, shape (n + 1, 3, 3).
+    r"""Return the precision that the motion requires at n + 1 equally spaced phases, shape (n + 1, 3, 3).
 
     This is the matrix theta of thesis Eq 5.1: the inverse of the learned covariance, without its scale.
 
     .. math:: \Theta(s) = \bar\sigma^2 (\Sigma(s) + \epsilon^2 I)^{-1}, \qquad \epsilon = 5\ mm
 
-    The factor is the mean variance of the motion, so a typical precision is 1. The eigenvalues are limited to 1/4 to 4:
-    no precision of the teacher is worth a collision.
+    The factor is the mean variance of the motion, so a typical precision is 1. The eigenvalues are limited to the range
+    from 1/4 to 4, because even a very precise demonstration must not outweigh a collision.
     """
     covariance = skill.tolerance(np.linspace(0.0, skill.duration_, N_SAMPLES + 1)) + _FLOOR**2 * np.eye(3)
     variances, axes = np.linalg.eigh(covariance)

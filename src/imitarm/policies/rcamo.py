@@ -1,4 +1,4 @@
-"""RCAMO, real-time collision avoidance for moving obstacles (thesis Chapter 5): the push of least predicted cost."""
+"""RCAMO, real-time collision avoidance for moving obstacles (thesis Chapter 5), by the least predicted cost."""
 
 from __future__ import annotations
 
@@ -49,36 +49,37 @@ class _Near(NamedTuple):
 class RCAMO(Policy):
     r"""Follow the primitive of a skill, and evade moving obstacles in the direction of least predicted cost.
 
-    The primitive (GMM, GMR, then DMP) gives the motion ``xi(s)`` for a scene without obstacles. The tool's deviation
-    ``e = x - xi(s)`` obeys the primitive's own spring and damper, with a coupling acceleration ``u``:
+    The skill's motion primitive (a DMP, fitted to the mean of GMR) gives the motion ``xi(s)`` for a scene without
+    obstacles; s is the phase. The tool's deviation ``e = x - xi(s)`` obeys the primitive's own spring and damper, with
+    a coupling acceleration ``u``:
 
     .. math:: \tau^2 \ddot e + D \tau \dot e + K e = \tau^2 u, \qquad \dot s = r / T
 
-    In every step, all candidates for ``u`` and for the speed ``r`` of the phase are rolled out over a horizon, with the
-    obstacles predicted at the velocities that the scene reports, and the candidate of least cost is taken (thesis Eq
-    5.5, corrected; see :class:`~imitarm.policies.least_cost.LeastCost`). To wait and to go back are candidates too.
-    Without an obstacle near, ``u = 0``, and the spring brings the tool back to its path. The phase stops
-    for a robot that lags.
+    In every step, the policy chooses ``u`` and the speed ``r`` of the phase. It predicts the motion of the tool and of
+    the obstacles over a horizon for every candidate, and takes the candidate of least cost (thesis Eq 5.5, corrected;
+    see :class:`~imitarm.policies.least_cost.LeastCost`). The candidates include waiting and going back. If no obstacle
+    is near, ``u = 0``, and the spring brings the tool back to its path. If the robot lags behind, the phase stops.
 
-    The policy keeps the tool clear. The links are kept clear by the :class:`~imitarm.safety.SafetyFilter`. The policy
-    decides step by step. It therefore can't know in advance whether the motion will arrive, and never raises
+    The policy keeps only the tool clear of obstacles; the :class:`~imitarm.safety.SafetyFilter` keeps the links clear.
+    The policy decides step by step. Therefore it can't know in advance whether the motion will arrive, and never raises
     InfeasibleError.
 
     Args:
         skill: skill to reproduce.
-        cost: ``"distance"``: by the signed distance, for any shape; ``"gaussian"``: as in the thesis (see
-            :mod:`~imitarm.policies.obstacle_cost`).
-        gains: ``"critical"``, ``"thesis"`` (K = 139.26, D = 28) or Gains, for the primitive and the deviation.
+        cost: ``"distance"``: the cost of an obstacle depends on the signed distance, for any shape; ``"gaussian"``:
+            Gaussian cost as in the thesis (see :mod:`~imitarm.policies.obstacle_cost`).
+        gains: stiffness K and damping D of the primitive and of the deviation: ``"critical"``, ``"thesis"`` (K =
+            139.26, D = 28) or Gains.
         margin: additional distance that grows with the look-ahead time, such as a
             :class:`~imitarm.perception.CoverageMargin`. None: ``min(beta sigma, cap)``, where sigma is the largest
             standard deviation of an obstacle's observed position.
         beta: see ``margin``.
         cap: see ``margin`` [m].
-        time_constant: tau of the deviation [s]; the thesis has 1.
-        max_acceleration: largest u [m/s^2]. The largest lasting deviation is ``tau^2 u / K``.
+        time_constant: tau, the time constant of the deviation [s]; the thesis uses 1 s.
+        max_acceleration: largest u [m/s^2]. A constant u leads to the deviation ``tau^2 u / K``.
         horizon: number H of predicted instants.
-        interval: time between them [s].
-        gain: feedback of the tool's position and rotation [1/s].
+        interval: time between two predicted instants [s].
+        gain: feedback gain of the tool's position and rotation [1/s].
         patience: e_0, the lag at which the phase stops [m].
         arrival: the motion has arrived when the tool is nearer than this to the goal [m].
         options: arguments of :class:`~imitarm.policies.Policy`.
@@ -145,7 +146,8 @@ class RCAMO(Policy):
     def resume(self, observation: Observation, phase: float) -> None:
         """Go on from the measured pose of the tool, at a fraction ``phase`` of the motion, 0 to 1.
 
-        The motion is that of the last :meth:`reset`; without one, it is that from the learned start.
+        The motion is the one that began with the last :meth:`reset`. If ``reset`` was never called, it is the motion
+        from the learned start.
         """
         phase = finite_number(phase, "RCAMO.resume: phase", at_least=0.0, at_most=1.0)
         instance(observation, Observation, "RCAMO.resume: observation")
@@ -337,15 +339,15 @@ class RCAMO(Policy):
         return Command(twist, progress=self._phase)
 
     def cost_field(self, scene: Scene, points: ArrayLike) -> Array:
-        r"""Return the cost of the tool at points, for drawing: the cost of thesis Eq 5.1, corrected.
+        r"""Return the cost of the tool at points, so that it can be drawn: the cost of thesis Eq 5.1, corrected.
 
         .. math:: J^G(\chi) = \tfrac12 w_e\,(\chi - \xi)^T \Theta\,(\chi - \xi) + \sum_i b_i(\chi)
 
-        The motion xi is represented by its point nearest to each chi, and the obstacles by their poses in the scene.
+        For each point chi, xi is the nearest point of the motion. The obstacles have their poses in the scene.
 
         Args:
             scene: goal and obstacles at one time.
-            points: positions of the tool's tip, shape (..., 3) [m]; the tool is not rotated against the learned start.
+            points: positions of the tool's tip, shape (..., 3) [m]; the tool has the rotation of the learned start.
 
         Returns:
             Shape (...).

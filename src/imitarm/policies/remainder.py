@@ -1,14 +1,15 @@
-r"""The rest of a motion that has begun: from the measured posture to the goal, joined smoothly to what was planned.
+r"""The rest of a motion that has begun: it starts at the measured posture and joins the planned motion smoothly.
 
-A plan displaces the learned path :math:`x_0(t)` by :math:`B(t)\,\Delta`. At the time s, the tool is measured at x. The
-rest of the motion is again an affine function of the displacements, with
+A plan displaces the learned path :math:`x_0(t)` by :math:`B(t)\,\Delta`. At the time s, the tool is measured at the
+position x.
+The rest of the motion is again an affine function of the displacements:
 
 .. math:: x(t) = x_0(t) + f(t)\,\bigl(x - x_0(s) + (t - s)\,\dot B(s)\,\Delta_0\bigr)
           + \bigl(B(t) - f(t)\,(B(s) + (t - s)\,\dot B(s))\bigr)\,\Delta .
 
-Here :math:`\Delta_0` are the planned displacements, and f falls smoothly from 1 at the time s to 0. This path begins at
-x for all :math:`\Delta`, in the direction in which the tool was planned to move. If the tool is where it was planned to
-be, the path with :math:`\Delta = \Delta_0` is the planned path. The tilts of the tool are joined in the same manner.
+Here :math:`\Delta_0` are the planned displacements, and f falls smoothly from 1 at the time s to 0. For every
+:math:`\Delta`, this path begins at x, in the planned direction of motion. If the tool is at its planned position, the
+path with :math:`\Delta = \Delta_0` is the planned path. The tilt of the tool joins the planned tilt in the same way.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ _STANDING = (
 
 @dataclass(frozen=True, eq=False)
 class Remainder:
-    """The rest of a motion, as a first guess for planning again.
+    """The rest of a motion; it is the first guess when the motion is planned again.
 
     Attributes:
         components: the rest of the path and its components; its times begin at 0.

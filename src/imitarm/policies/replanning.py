@@ -1,4 +1,4 @@
-"""replan: plan the rest of a motion of the whole arm again, from where the arm is now."""
+"""replan: plan the rest of a motion of the whole arm again, from the measured posture of the arm."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def replan(
     hold: float = 0.0,
     max_attempts: int | None = None,
 ) -> Adaptation:
-    """Plan the rest of a motion again, for example because an obstacle is not where it was.
+    """Plan the rest of a motion again, for example because an obstacle has moved.
 
-    The motion goes on from the measured posture, in the planned direction and with the measured speed. It passes each
-    obstacle on the side that was chosen before, if it can, and is displaced as in ``previous`` where this keeps the
-    clearance. Only the rest of the path is planned; the certificate covers it from the measured posture to the goal.
-    The posture at the start can't be changed any more, and there is no approach.
+    The motion goes on from the measured posture, in the planned direction and with the measured speed. If possible, it
+    passes each obstacle on the same side as ``previous``. Wherever the displacement of ``previous`` keeps the
+    clearance, the motion keeps this displacement. Only the rest of the path is planned; the certificate covers it from
+    the measured posture to the goal. The plan can't choose another posture at the start, so it has no approach.
 
     The rest begins at time 0. At that time, the obstacles are at the poses given by the scene; from then on, they move
     with their velocities. To plan once more, pass the result as ``previous``.
@@ -57,18 +57,20 @@ def replan(
         scene: obstacles now; its goal is None, or the goal of ``previous``.
         arm: the arm with its tool.
         state: measured state of the arm.
-        phase: present time in ``previous.trajectory``, counted from the end of its approach [s].
+        phase: time that has passed since the approach of ``previous`` ended [s]; it is a time of
+            ``previous.trajectory``.
         clearance: required distance from the whole arm to every obstacle [m].
         forbidden: directions in which no component may move, shape (m, 3); see :func:`adapt`.
         max_tilt: largest rotation of the tool away from the learned rotation [rad]; see :func:`adapt`.
-        goal_tilt: largest such rotation at the goal [rad]; see :func:`adapt`.
-        allowance: additional clearance for tracking errors, used if ``previous`` has it and a
-            path with this larger clearance is found [m].
-        margin: bound of the error with which obstacles are predicted; see :func:`adapt`.
-        margin_horizon: time since an obstacle was seen after which its margin does not grow [s]; see :func:`adapt`.
-        hold: time after the arrival for which the whole arm must keep its clearances at the goal too [s].
-        max_attempts: largest number of attempts of the search for a joint path, to limit the computing time; None: no
-            limit. Attempts to execute the path later, so that obstacles pass first, are not counted.
+        goal_tilt: largest rotation of the tool away from the learned rotation at the goal [rad]; see :func:`adapt`.
+        allowance: additional clearance for tracking errors [m]. It is used if ``previous`` has this larger clearance
+            and a path with it is found.
+        margin: bound of the error of the predicted obstacle positions; see :func:`adapt`.
+        margin_horizon: the margin grows until this time after the obstacle was seen [s]; see :func:`adapt`.
+        hold: the whole arm must keep its clearances at the goal for this long after the arrival [s].
+        max_attempts: largest number of attempts in the search for a joint path, to limit the computing time; None: no
+            limit. The search may also try to execute the path later, so that obstacles pass first; such attempts are
+            not counted.
 
     Returns:
         The adaptation of the rest of the motion; check ``feasible`` before executing it. If it is not feasible, the arm

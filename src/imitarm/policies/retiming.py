@@ -1,7 +1,7 @@
 r"""Execution times for a joint path, from rest to rest, within the limits of velocity, acceleration and torque.
 
-Along a path q(s) with the path parameter s and the speed :math:`\dot s`, all limits are linear in :math:`b = \dot s^2`
-and :math:`a = \ddot s`:
+Let s be the parameter of the path q(s), :math:`\dot s` its rate, :math:`b = \dot s^2` and :math:`a = \ddot s`.
+Then all limits are linear in a and b:
 
 .. math:: |q'| \sqrt b \le \dot q_{max}, \qquad |q' a + q'' b| \le \ddot q_{max}, \qquad
           |M q'\,a + (M q'' + C(q, q') q')\,b + g| \le \tau_{max}
@@ -11,9 +11,9 @@ still be executed. A second pass, from the start to the end, takes the largest p
 method is that of Pham and Pham, "A new approach to time-optimal path parameterization based on reachability analysis",
 IEEE T-RO 34(3), 2018.
 
-A *schedule* executes a path later or more slowly, so that a moving obstacle can pass first. It is an upper limit of the
-rate ds/dt at each sample. A *wait* at a sample is a very slow motion from this sample to the next one. The method above
-then brakes the arm before this place and accelerates it afterwards, within all limits.
+A *schedule* executes a path later or more slowly, so that a moving obstacle can pass first. It limits the rate ds/dt at
+each sample. A *wait* at a sample is a very slow motion from this sample to the next one. The method above then brakes
+the arm before this place and accelerates it afterwards, within all limits.
 """
 
 from __future__ import annotations
@@ -77,16 +77,17 @@ def retimed(
     path: ArmPath | None = None,
     rate: float = 0.0,
 ) -> Timing:
-    """Return the shortest execution times of a path within the limits of an arm, until rest.
+    """Return the shortest execution times of a path within the limits of an arm; the motion ends at rest.
 
     Args:
         arm: the arm with its tool.
         joints: joint positions at the samples, shape (n, n_joints) [rad].
-        parameters: path parameter s of each sample, increasing, shape (n,) [s]. If the rate ds/dt is 1 everywhere, each
-            sample is reached at the time s.
+        parameters: path parameter s of each sample, increasing, shape (n,) [s]. If the rate ds/dt is 1 everywhere, the
+            arm reaches each sample at the time s.
         fastest: largest allowed rate ds/dt at each sample, shape (n,).
-        path: the arm in these postures, if it is known already.
-        rate: the rate ds/dt at the first sample, if the limits allow it; otherwise the largest rate that they allow.
+        path: kinematics of the arm in these postures, if they are already known.
+        rate: desired rate ds/dt at the first sample. If the limits do not allow this rate, the largest allowed rate is
+            used.
     """
     first = np.gradient(joints, parameters, axis=0)
     second = np.gradient(first, parameters, axis=0)
@@ -111,24 +112,26 @@ def retimed(
 def safe_rates(
     around: ArmAmongObstacles, path: ArmPath, times: Array, clock: Array, allowance: float, *, tool_only: bool = False
 ) -> Array:
-    """Return the largest rate ds/dt at each sample at which no distance shrinks faster than the safety filter allows.
+    """Return the largest rate ds/dt at each sample with which no distance shrinks faster than the safety filter allows.
 
-    The distances may shrink at nine tenths of the rates of the filter's own rows
-    (:func:`~imitarm.scene.braking.shrink_rates`). The safety filter measures distances to where the obstacles are
-    predicted, so margins are left out. An obstacle that approaches by itself does not slow the motion down: the arm
-    would still be in its way. The path and its times must keep the clearance in that case.
+    The distances may shrink at nine tenths of the rates that the safety filter allows
+    (:func:`~imitarm.scene.braking.shrink_rates`). The filter measures distances to the predicted positions of the
+    obstacles, so margins are left out. If an obstacle approaches a part of the arm, a slower motion would not help,
+    because the arm would still be in its way. Only the motion of the arm itself therefore limits the rate. The path and
+    its times must keep the clearance to moving obstacles.
 
     Args:
         around: the arm, its obstacles and the required clearances.
         path: the arm at n samples.
         times: path parameter s of each sample, increasing, shape (n,) [s].
-        clock: time at which each sample is compared with the places of the obstacles, shape (n,) [s].
+        clock: time at which the arm is expected at each sample, shape (n,) [s]; the obstacles are predicted for this
+            time.
         allowance: required clearance minus the clearance that the safety filter keeps [m].
-        tool_only: whether only the distances between the last link with its tool and obstacles count. They are the
-            same in every posture in which the tool is at the same pose.
+        tool_only: whether to consider only the distances from obstacles to the last link with its tool. These distances
+            depend only on the pose of the tool, not on the arm's posture.
 
     Returns:
-        Shape (n,), at most 1.
+        Rates, at most 1, shape (n,).
     """
     velocity = np.gradient(path.joints, times, axis=0)
     fastest_obstacle, slowest = around.fastest_obstacle, APPROACH_RATE
@@ -157,8 +160,8 @@ class Schedule:
 
     Attributes:
         fastest: largest rate ds/dt at each sample, shape (n,).
-        clock: time of each sample, roughly, without limits of acceleration, shape (n,) [s].
-        delay: by how much the motion arrives later [s].
+        clock: approximate time of each sample, without limits of acceleration, shape (n,) [s].
+        delay: time by which the schedule delays the arrival [s].
     """
 
     fastest: Array
@@ -171,8 +174,8 @@ def schedules(times: Array, clock: Array, *, at_rest: bool) -> list[Schedule]:
 
     Args:
         times: times of the samples in the learned motion, from 0, shape (n,) [s].
-        clock: times at which the samples are reached without a delay, shape (n,) [s].
-        at_rest: whether the motion begins at rest, so that the arm can wait where it is.
+        clock: times at which the arm reaches the samples without a delay, shape (n,) [s].
+        at_rest: whether the motion begins at rest, so that the arm can wait at the first sample.
     """
     return sorted(_schedules(times, clock, at_rest), key=lambda one: one.delay)
 

@@ -1,12 +1,12 @@
 """A roadmap of displacements over time: possible positions of the tool at each time, and connections between them.
 
 The nodes are arranged in layers. Each layer belongs to one time on the nominal path. In each layer, rays in all
-directions start at the nominal position of this time. On each ray, the points just outside the inflated obstacles are
-the nodes. Edges lead from each node to the nodes of the next layer on the same and on neighbouring rays. The cost of an
-edge is the change of the displacement, plus a large amount where the two tangents at its ends do not prove the
-clearance. A narrow gap between obstacles may lie between two rays. If no route is found, a second roadmap therefore has
-additional rays that are aimed at gaps. Dynamic programming from both ends computes, for each node, the cheapest route
-through this node. A route is only a proposal: the search for the least detour takes its first tangents along the route.
+directions start at the nominal position of this time. The nodes of a ray are its points just outside the inflated
+obstacles. Edges lead from each node to the nodes of the next layer on the same and on neighbouring rays. The cost of an
+edge is the change of the displacement, plus a large amount if the two tangents at its ends do not prove the clearance.
+A narrow gap between obstacles may lie between two rays. If no route is found, a second roadmap therefore has additional
+rays that are aimed at gaps. Dynamic programming from both ends computes, for each node, the cheapest route through this
+node. A route is only a proposal: the search for the least detour takes its first tangents along the route.
 """
 
 from __future__ import annotations
@@ -54,13 +54,14 @@ class Roadmap:
     Args:
         path: the nominal path and its components.
         tool: the tool and the obstacles.
-        clearance: required [m].
+        clearance: required clearance [m].
         allowed: directions in which components may move.
         aimed: whether to add rays that lead into gaps between the obstacles.
 
     Attributes:
         layers: index of the path's sample at each layer, shape (n_layers,).
-        nodes: displacements of the nominal positions, shape (n_layers, n_nodes, 3) [m]; node 0 is the nominal position.
+        nodes: displacement of each node from the nominal position, shape (n_layers, n_nodes, 3) [m]; node 0 is the
+            nominal position.
     """
 
     def __init__(
@@ -90,7 +91,7 @@ class Roadmap:
     def routes(self, n: int) -> Iterator[Array]:
         """Yield up to ``n`` routes as displacements of the tip at all samples (n_samples, 3) [m], cheapest first.
 
-        Each further route goes through another node of the layer in which the previous routes came closest to an
+        Each further route passes through a new node in the layer in which the previous routes came closest to an
         obstacle.
         """
         through = self._forward[0] + self._backward[0]
@@ -323,7 +324,7 @@ class Roadmap:
 
     @property
     def is_hopeless(self) -> bool:
-        """Whether no route exists, or the cheapest route has an edge with far too little clearance."""
+        """Whether the roadmap has no useful route: no route at all, or only routes with far too little clearance."""
         if not self._forward[0][-1, 0] < _BLOCKED:
             return True
         edges = self._edges_of(self._through(len(self.layers) - 1, 0))

@@ -19,7 +19,7 @@ _RETRY = 0.2  # [s] after which a stage that could not start is tried again
 
 
 def learned_goal(scene: Scene) -> Pose | None:
-    """Return the goal of the scene, which is None for the learned goal."""
+    """Return the goal of the scene; None stands for the learned goal."""
     return scene.goal
 
 
@@ -28,7 +28,7 @@ class Stage:
     """One motion of a :class:`StagedPolicy`, and what the gripper does at its end.
 
     Attributes:
-        name: name for messages.
+        name: name of the stage in messages.
         policy: policy that makes the motion.
         goal: function that returns the goal of the motion (tool_to_base) in an observed scene. The function is called
             in every control step, so the goal may follow an object. The default is the goal of the scene.
@@ -53,10 +53,10 @@ class Stage:
 class StagedPolicy(Policy):
     """Makes several motions one after another, for example to pick an object and to place it.
 
-    Each stage has its own policy. When its motion has arrived, the gripper gets its new opening, and the arm stands
-    still for the hold time. Then the next stage begins at the measured pose. A stage may refuse to start, for example
-    because an obstacle stands on its goal. The arm then waits, and the stage is tried again every 0.2 s. Only a refusal
-    of the first stage is an error, because nothing has moved yet.
+    Each stage has its own policy. When the motion of a stage has arrived, the gripper moves to its new opening, and the
+    arm stands still for the hold time. Then the next stage begins at the measured pose. The policy of a stage may
+    refuse to start, for example because an obstacle stands on the goal. The arm then waits, and tries the stage again
+    every 0.2 s. Only a refusal of the first stage is an error, because nothing has moved yet.
 
     Args:
         stages: the motions, at least one.
@@ -75,7 +75,7 @@ class StagedPolicy(Policy):
 
     @property
     def plan(self) -> Any:
-        """Plan of the present stage."""
+        """Plan of the current stage."""
         return self.stage.policy.plan
 
     @property
@@ -93,7 +93,7 @@ class StagedPolicy(Policy):
         self.stage.policy.reset(self._seen(observation))
 
     def step(self, observation: Observation, dt: float) -> Command:
-        """Return the command of the present stage; between stages, the arm stands still while the fingers move."""
+        """Return the command of the current stage; between stages, the arm stands still while the fingers move."""
         if self._waiting:
             self._start(observation)
             if self._waiting:

@@ -1,12 +1,13 @@
-r"""certified_stop: brake a moving arm to rest and hold it there, with a certificate for both.
+r"""certified_stop: brake a moving arm to rest and hold it at rest, with a certificate for the whole motion.
 
-All joints brake together, with the constant deceleration that the slowest joint allows. In joint space, the arm then
-moves on a straight line, and it stops after the time
+All joints brake in the same time, each with a constant deceleration. The joint that needs longest determines this time.
+In joint space, the arm therefore moves on a straight line. It stops after the time
 
 .. math:: t_b = \max_j \frac{|\dot q_j|}{a_j} .
 
-The posture in which the arm stops is held until the end of the horizon. The certificate of the whole arm
-(:mod:`~imitarm.policies.arm_certificate`) covers both parts.
+Here, :math:`\dot q_j` is the velocity of joint j and :math:`a_j` its acceleration limit. The arm keeps the posture in
+which it stops until the end of the horizon. The certificate of the whole arm (:mod:`~imitarm.policies.arm_certificate`)
+covers both parts.
 """
 
 from __future__ import annotations
@@ -39,12 +40,12 @@ class Stop:
     """A motion that ends at rest, and its certificate.
 
     Attributes:
-        times: from 0 to the end of the horizon, shape (n,) [s].
+        times: times of the samples, from 0 to the end of the horizon, shape (n,) [s].
         joints: joint positions, shape (n, n_joints) [rad]; linear between the samples.
         clearance: guaranteed lower bound of the clearance of the whole arm [m], or, if ``certified`` is False, a
             measured clearance that is too small.
         certified: whether the whole arm keeps its clearances until the end of the horizon.
-        reason: what comes too close; empty if ``certified``.
+        reason: names the parts that come too close to each other; empty if ``certified``.
     """
 
     times: Array
@@ -69,11 +70,11 @@ def certified_stop(
     Args:
         arm: the arm with its tool.
         state: measured state of the arm.
-        scene: obstacles now, with their velocities, and fixtures. A part of the arm that is nearer to a fixture than
-            ``clearance`` now may stay as near.
+        scene: the observed obstacles with their velocities, and the fixtures. If a part of the arm is already nearer to
+            a fixture than ``clearance``, it may stay at this distance.
         clearance: required distance from the whole arm to every obstacle [m].
-        horizon: time for which the certificate holds, from now [s].
-        margin: bound of the error with which obstacles are predicted; see :func:`~imitarm.policies.adapt`.
+        horizon: the certificate holds from now until this time has passed [s].
+        margin: bound of the error of the predicted obstacle positions; see :func:`~imitarm.policies.adapt`.
         margin_horizon: see :func:`~imitarm.policies.adapt` [s].
 
     Raises:

@@ -21,8 +21,8 @@ class Tilts:
     r"""All tilts that a plan can choose from.
 
     A tilt is a rotation vector as a function of time: a fixed part and a sum of smooth functions,
-    :math:`\tau(t) = \tau_0(t) + \sum_k B_k(t)\,c_k`. The coefficients :math:`c_k` are planned. The rotation vector
-    turns the learned rotation, in the base frame.
+    :math:`\tau(t) = \tau_0(t) + \sum_k B_k(t)\,c_k`. The planner chooses the coefficients :math:`c_k`. The rotation
+    vector is applied to the learned rotation, in the base frame.
 
     Attributes:
         basis: the functions B at the samples, shape (n, n_tilts).
@@ -34,7 +34,7 @@ class Tilts:
 
     @classmethod
     def between_ends(cls, times: Array, *, tilted_goal: bool, window: Array | None = None) -> Tilts:
-        """Return tilts that are zero at the start, and at the goal too unless ``tilted_goal`` is set.
+        """Return tilts that are zero at the start; they are also zero at the goal unless ``tilted_goal`` is True.
 
         Args:
             times: n increasing times [s].
@@ -46,7 +46,7 @@ class Tilts:
 
     @property
     def n_tilts(self) -> int:
-        """Number of functions, which is the number of rows of the coefficients."""
+        """Number of smooth functions, which is also the number of rows of the coefficients."""
         return self.basis.shape[1]
 
     def vectors(self, coefficients: Array, samples: Index | slice = slice(None)) -> Array:

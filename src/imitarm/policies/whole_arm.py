@@ -9,9 +9,10 @@ The search makes the following attempts in turn. Each attempt keeps more of the 
 5. another posture at the start, if the arm can reach it by a clear motion before the motion of the skill begins;
 6. the best failed attempts again, with narrower components.
 
-If a plan takes much longer than the learned motion, a few more attempts are made, and the shortest plan is returned.
-If no other posture helps, because the tool itself passes an obstacle slowly, only other paths of the tool are tried.
-If no attempt succeeds, the reason states which link and obstacle come too close in the best attempt, and when.
+If a plan takes much longer than the learned motion, the search makes a few more attempts and returns the plan that
+takes the least time. If the tool itself must pass an obstacle slowly, no other posture helps, so the search tries only
+other paths of the tool. If no attempt succeeds, the reason states which link and obstacle come too close in the best
+attempt, and at which time.
 """
 
 from __future__ import annotations
@@ -65,8 +66,8 @@ def solve(task: ArmTask, path: ComponentPath, displacement: Array) -> ArmSolutio
     Args:
         task: the arm and its surroundings.
         path: the path of the tool and its components.
-        displacement: displacements of the components to begin with, such as those of the detour of the tool alone,
-            shape (n_components, 3) [m].
+        displacement: first guess of the components' displacements, for example from the detour of the tool alone, shape
+            (n_components, 3) [m].
     """
     search = _Search(task, path, displacement)
     if search.start.room < 0.0:

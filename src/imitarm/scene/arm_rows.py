@@ -1,7 +1,7 @@
 """Distances of an arm's spheres to obstacles and to each other, with their gradients, for the safety filter.
 
-Compiled code computes them where it has been built (:mod:`imitarm.compiled`), and NumPy otherwise. Both return the same
-numbers up to rounding.
+If the compiled code has been built (:mod:`imitarm.compiled`), it computes these distances, otherwise NumPy. Both give
+the same numbers up to rounding.
 """
 
 from __future__ import annotations
@@ -134,7 +134,8 @@ class SpherePairs:
     Attributes:
         cover: the spheres.
         outer: index of the sphere that is farther from the base, shape (k,).
-        inner: index of the other sphere; those of the base follow those of the arm, shape (k,).
+        inner: index of the sphere nearer to the base, shape (k,); the spheres of the base are numbered after the
+            spheres of the arm.
         sums: sum of the two radii, shape (k,) [m].
         starts: first pair of each group, shape (g,).
     """

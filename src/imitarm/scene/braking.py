@@ -1,13 +1,14 @@
-r"""How fast the distance between an arm and an obstacle may shrink, so that the arm can still brake or yield in time.
+r"""Rates at which the distance from an arm to an obstacle may shrink, so that the arm can still brake or yield.
 
-The joints can change the speed of a part of the arm along a direction only within some time t, while the distance goes
-on shrinking. Let w be the rate at which the remaining distance h shrinks, T the delay after which a command takes
-effect, and let the joints bring w evenly to zero. The remaining distance suffices if
+Let h be the remaining distance [m], and w the rate at which it shrinks [m/s]. A command takes effect after the delay T
+[s]. Then the joints reduce w evenly to zero within the time t [s], while the distance still shrinks. The remaining
+distance suffices if
 
 .. math:: h \;\ge\; w\,T + \tfrac12 w\,t \qquad\Leftrightarrow\qquad w \;\le\; \frac{h}{T + t/2} .
 
-:func:`shrink_rates` returns the factor of h. The rows of the safety filter
-(:class:`~imitarm.scene.clearance_limit.ClearanceLimit`) and the execution times of planned paths use it, so they agree.
+The function :func:`shrink_rates` returns 1 / (T + t/2), the factor of h. Both the safety filter
+(:class:`~imitarm.scene.clearance_limit.ClearanceLimit`) and the execution times of planned paths use this factor, so
+they agree.
 """
 
 from __future__ import annotations
@@ -38,27 +39,28 @@ def shrink_rates(
 ) -> Array | float:
     r"""Return the fraction of each distance by which it may shrink per second [1/s].
 
-    The result is :math:`\min(\text{most},\, 1/(T + t/2))`. The time t [s] is the longer one of two times:
+    The result is :math:`\min(\text{most},\, 1/(T + t/2))`. The time t [s] is the longer of two times:
 
-    * All joints brake together from the velocity :math:`\dot q` to rest in :math:`\max_j |\dot q_j| / a_j`, where
-      :math:`a_j` is the acceleration limit of joint j.
-    * A part of the arm at rest reaches the speed :math:`v_o` of the obstacle that approaches it in
-      :math:`v_o / (0.1 \sum_j |g_j| a_j)`, at most 1.5 s. Here, g is the gradient of the distance with respect to the
-      joints, and the sum is the acceleration along the normal if every joint served this part alone. Only a tenth of it
-      is counted on, because other parts of the arm must yield at the same time, and the tool shall stay where it is.
-      For a part that can't become as fast as the obstacle, this time is 0, because an early start would not help.
+    * The braking time :math:`\max_j |\dot q_j| / a_j`, in which all joints together brake from the velocity :math:`\dot
+      q` to rest. :math:`a_j` is the acceleration limit of joint j.
+    * The yielding time :math:`v_o / (0.1 \sum_j |g_j| a_j)`, at most 1.5 s, in which a part of the arm at rest reaches
+      the speed :math:`v_o` of an approaching obstacle. Here, g is the gradient of the distance with respect to the
+      joints. The sum is the acceleration along the normal if every joint moved only this part. The formula uses only a
+      tenth of this sum, because other parts of the arm must yield at the same time, and the tool should keep its
+      position. If a part can't become as fast as the obstacle, the yielding time is 0, because an early start would not
+      help.
 
     Args:
         arm: the arm, with its limits of velocity and acceleration.
         gradients: derivatives of k distances with respect to the joints, shape (k, n_joints) [m/rad].
-        approach: speed at which each obstacle approaches, shape (k,) [m/s]; None: all are at rest.
-        velocity: joint velocity, one of shape (n_joints,) or one for each distance (k, n_joints) [rad/s]; None: at
-            rest.
+        approach: speed at which each obstacle approaches, shape (k,) [m/s]; None: all obstacles are at rest.
+        velocity: joint velocity, shape (n_joints,), or one for each distance, shape (k, n_joints) [rad/s]; None: the
+            arm is at rest.
         most: largest result [1/s].
-        delay: T, the control period plus the latency, one number or of shape (k,) [s].
+        delay: T, the control period plus the latency [s]; one number, or one for each distance, shape (k,).
 
     Returns:
-        Shape (k,), or one number for all if all obstacles are at rest.
+        One rate for each distance, shape (k,) [1/s], or one number for all distances if all obstacles are at rest.
     """
     time: Array | float = 0.0
     if velocity is not None:

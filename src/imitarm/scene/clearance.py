@@ -40,22 +40,23 @@ class SelfClearance:
 
     .. math:: d = |c_i - c_j| - r_i - r_j, \qquad \nabla d = n^T (J_i - J_j), \quad n = (c_i - c_j)/|c_i - c_j|
 
-    A row :math:`\nabla d\, v \ge -\xi (d - d_{safe})` lets the distance shrink no faster than exponentially towards the
-    required clearance :math:`d_{safe}`. If the distance is below the clearance, the distance must grow, and 25/s
-    replaces :math:`\xi` in the row. Every pair of spheres whose distance is less than the clearance plus 6 cm has a row
-    (at most the 64 nearest pairs). In addition, pairs of links that are less than 15 cm apart (at most the ``n_rows``
-    nearest) have one row each, for their nearest pair of spheres.
+    Let v be the joint velocity. A row, which is the inequality :math:`\nabla d\, v \ge -\xi (d - d_{safe})`, lets the
+    distance shrink no faster than exponentially towards the required clearance :math:`d_{safe}`. If the distance is
+    below the clearance, the distance must grow, and 25/s replaces :math:`\xi` in the row. A pair of spheres has a row
+    if its distance is less than the clearance plus 6 cm; only the 64 nearest pairs count. In addition, a pair of links
+    has one row, for its nearest pair of spheres, if the links are less than 15 cm apart; only the ``n_rows`` nearest
+    pairs of links count.
 
-    Three kinds of pairs are not checked: links that share a joint, links that can't touch within their joint limits
-    (:func:`meeting_links`), and pairs of spheres that are nearer to each other than the clearance when the arm is in
-    its home posture. The base is included in the check. The object on which the base stands is not part of the arm; add
-    this object to the scene.
+    Three kinds of pairs are not checked. The first kind are links that share a joint. The second are links that can't
+    touch within their joint limits (:func:`meeting_links`). The third are pairs of spheres that are nearer to each
+    other than the clearance when the arm is in its home posture. The base is included in the check. The object on which
+    the base stands is not part of the arm; add this object to the scene.
 
     Args:
         arm: the arm with its tool.
-        clearance: least distance [m].
+        clearance: required distance between links [m].
         n_rows: largest number of pairs of links that have a row.
-        gain: xi [1/s].
+        gain: :math:`\xi`, the largest fraction of the remaining distance that may vanish per second [1/s].
 
     Raises:
         InputError: when a number can't be used.
@@ -96,7 +97,7 @@ class SelfClearance:
             q: joint positions, shape (n_joints,) [rad].
 
         Returns:
-            inf when the arm has no two links that could touch.
+            The distance [m]; inf if no two links of the arm could touch.
         """
         if not self.n_pairs:
             return math.inf
@@ -166,7 +167,7 @@ class SelfClearance:
         return np.where(room < 0.0, -_RETREAT_RATE, -self._gain) * room
 
     def periodic(self, dt: float = 0.01) -> PeriodicSelfClearance:
-        """Return a version of this check that takes a fifth of its time, for a control loop with period ``dt`` [s]."""
+        """Return a version of this check for a control loop with period ``dt`` [s]; it takes a fifth of the time."""
         return PeriodicSelfClearance(self, dt)
 
     def _found(self, q: ArrayLike, box: Box | None = None) -> OwnRows | None:
@@ -178,11 +179,11 @@ class PeriodicSelfClearance:
     r"""Rows of a :class:`SelfClearance` for a fast control loop: near pairs are searched for only every 30 to 50 ms.
 
     Between two searches, the distances follow from the joints' motion, :math:`d(q) \approx d_0 + \nabla d\,(q - q_0)`.
-    Within 50 ms the error of this approximation is less than 8 mm with every joint at 1 rad/s; it grows with the square
-    of the speed.
+    If every joint moves at 1 rad/s, the error of this approximation stays below 8 mm for 50 ms. The error grows with
+    the square of the speed.
 
     Args:
-        own: self-clearance whose rows are approximated.
+        own: the self-clearance check whose rows are approximated.
         dt: control period [s].
     """
 
@@ -202,7 +203,8 @@ class PeriodicSelfClearance:
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
-            may_search: whether this step has time for a search; an overdue search takes place anyway.
+            may_search: whether this step has time for a search. If a search is overdue, it takes place even if this is
+                False.
         """
         self._age += 1
         if self._age > self._latest or (may_search and self._age > self._every):
@@ -215,12 +217,12 @@ class PeriodicSelfClearance:
 
 @lru_cache(maxsize=16)
 def meeting_links(arm: ArmModel) -> NDArray[np.bool_]:
-    """Return for every pair of links whether they can touch within the limits of the joints between them.
+    """Return, for every pair of links, whether the two links can touch within the limits of the joints between them.
 
-    Link 0 is the base; link k is moved by k joints. Neighbouring links are always reported as not meeting. For links
-    with two or three joints between them, the distance of their exact shapes is measured in 512 postures that fill the
-    ranges of these joints evenly (a Sobol sequence). Links that touch in none of these postures are reported as not
-    meeting. Links with four or more joints between them are always reported as meeting.
+    Link 0 is the base; k joints move link k. For neighbouring links, the answer is always False. For links with two or
+    three joints between them, the distance of their exact shapes is measured in 512 postures, which fill the ranges of
+    these joints evenly (a Sobol sequence). If the links touch in none of these postures, the answer is False. For links
+    with four or more joints between them, the answer is always True.
 
     Args:
         arm: the arm with its tool.

@@ -38,25 +38,25 @@ class ClearanceLimit:
 
     The row lets h shrink at most exponentially, and so slowly that the arm can still brake or yield to the obstacle
     before h is 0. Here, t is the time that braking or yielding takes, and T is the delay of the commands
-    (:func:`~imitarm.scene.braking.shrink_rates`). For obstacles at rest, k is nearly always :math:`\xi`. Before a fast
-    obstacle, and for links that the joints accelerate only slowly, k is smaller, so the arm yields earlier. In theory h
+    (:func:`~imitarm.scene.braking.shrink_rates`). For obstacles at rest, k is nearly always :math:`\xi`. If an obstacle
+    is fast, or if the joints can accelerate a link only slowly, k is smaller, so the arm yields earlier. In theory h
     stays positive. In practice h can become negative, because links move on arcs and control steps are finite. While h
     is negative, ``retreat_rate`` replaces k, and h must grow.
 
-    Every sphere within ``influence`` of an obstacle has a row; none is left out, except rows that no velocity within
-    the limits of the joints can violate. The spheres contain the shapes they cover, so the true distance is never
-    smaller than the distance of the spheres.
+    Every sphere within ``influence`` of an obstacle has a row, unless no velocity within the limits of the joints can
+    violate this row. The spheres contain the shapes that they cover, so the true distance is never smaller than the
+    distance of the spheres.
 
     Args:
         arm: arm with its tool.
         clearance: required distance of every link to every obstacle [m].
-        rate: ``xi``; while h is positive, it may shrink by at most this fraction of itself per second [1/s].
-        influence: value of h beyond which a sphere has no row [m]. It is extended by 0.75 s times the speed of the
-            fastest obstacle.
-        retreat_rate: while h is negative, it must grow by at least this fraction of its magnitude per second [1/s].
+        rate: :math:`\xi`; while h is positive, h may shrink by at most this fraction of itself per second [1/s].
+        influence: a sphere has no row if its h is larger than this [m]. If obstacles move, the influence is extended by
+            0.75 s times the speed of the fastest obstacle.
+        retreat_rate: while h is negative, h must grow by at least this fraction of its magnitude per second [1/s].
         delay: T, the control period plus the latency of the arm [s]; the age of each obstacle is added.
-        deviations: number of standard deviations of each obstacle's position along the normal that are subtracted from
-            its distance, from the obstacle's covariance.
+        deviations: if an obstacle has a covariance, this many standard deviations of its position along the normal are
+            subtracted from its distance.
 
     Raises:
         InputError: when ``arm`` is not an ArmModel, or a number is not finite or is negative.
@@ -92,7 +92,7 @@ class ClearanceLimit:
         Args:
             q: joint positions, shape (n_joints,) [rad].
             scene: obstacles predicted for the current time, with their velocities.
-            velocity: joint velocity, shape (n_joints,) [rad/s]; None: at rest.
+            velocity: joint velocity, shape (n_joints,) [rad/s]; None: the arm is at rest.
 
         Returns:
             One row for each pair of a sphere and an obstacle within ``influence``; None when there is no pair. A pair
@@ -112,15 +112,15 @@ class ClearanceLimit:
         margins: Array | None = None,
         box: Box | None = None,
     ) -> NearRows | None:
-        """Return the inequalities and the pairs to which they belong; same arguments and errors as :meth:`rows`.
+        """Return the inequalities and the pairs to which they belong; the errors are those of :meth:`rows`.
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
             scene: obstacles predicted for the current time, with their velocities.
-            velocity: joint velocity, shape (n_joints,) [rad/s]; None: at rest.
-            margins: distance added to the clearance of each obstacle, shape (n_obstacles,) [m]; None: nothing.
-            box: bounds of the joint velocity; rows that no velocity within them violates are left out. None: the
-                velocity limits of the arm.
+            velocity: joint velocity, shape (n_joints,) [rad/s]; None: the arm is at rest.
+            margins: distance added to the clearance of each obstacle, shape (n_obstacles,) [m]; None: nothing is added.
+            box: bounds of the joint velocity; rows that no velocity within these bounds violates are left out. None:
+                the velocity limits of the arm.
         """
         packed = scene.packed
         if not len(packed):

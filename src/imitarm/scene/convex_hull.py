@@ -23,11 +23,12 @@ _SAME_PLANE = 1e-12  # neighbouring triangles belong to one face when the cosine
 
 @dataclass(frozen=True)
 class Polytope:
-    """Faces and edges of a hull in its local frame, so that they stay valid when the hull moves.
+    """Faces and edges of a hull in its local frame; they stay valid when the hull moves.
 
     If ``n_i.x = b_i`` are the planes of the faces, the distance inside is ``sd = max_i (n_i.x - b_i)``. Outside, this
     maximum is a lower bound of the distance. The bound is exact if the foot point ``x - sd n_i`` is on the face;
-    otherwise the nearest point is on an edge or at a corner, and the distance is the smallest distance to an edge.
+    otherwise the nearest surface point is on an edge or at a corner, and the distance is the smallest distance to an
+    edge.
 
     Attributes:
         vertices: corners of the hull, shape (v, 3) [m].

@@ -24,7 +24,7 @@ def displaced_distances(
         packed: obstacles at their reference time.
         members: index of the obstacle of each group, shape (k,).
         times: time of each group, after the obstacles' reference time, shape (k,) [s].
-        origins: points in the base frame, shape (k, 3) [m].
+        origins: origin of each group in the base frame, shape (k, 3) [m].
         scales: shape (k,) [m].
         directions: vectors of any length, shape (m, 3).
 

@@ -42,7 +42,7 @@ _OF_THE_POSE = frozenset(("positions", "_frames", "_ahead", "_shapes", "_record"
 
 
 class Members(NamedTuple):
-    """The obstacles of one ``PackedObstacles`` that share one distance formula."""
+    """Those obstacles of a ``PackedObstacles`` that share a distance formula."""
 
     formula: Formula
     places: slice  # in the order of ``PackedObstacles._sorted``
@@ -128,7 +128,7 @@ class PackedObstacles:
         stamp: float | Array,
         covariances: Array | None = None,
     ) -> PackedObstacles:
-        """Return the same shapes with other poses, seen at ``stamp`` [s]: one time, or one for each obstacle (n,).
+        """Return the same shapes with other poses; ``stamp`` [s] is one time, or one time for each obstacle (n,).
 
         Each of the other arguments is the new value of the attribute with the same name; without ``covariances``, the
         covariances are kept.
@@ -146,7 +146,7 @@ class PackedObstacles:
         return moved
 
     def take(self, indices: Indices) -> PackedObstacles:
-        """Return some of the obstacles, those with ``indices`` (k,)."""
+        """Return the obstacles with the given ``indices`` (k,)."""
         rows = {name: getattr(self, name)[indices] for name in _ROWS}
         return PackedObstacles(**rows, polytopes=tuple(self.polytopes[i] for i in indices.tolist()))
 
@@ -157,7 +157,7 @@ class PackedObstacles:
         return moved
 
     def __getattr__(self, name: str) -> Array:
-        """Compute ``positions`` when they are first read from a result of :meth:`after`; else raise an error."""
+        """Compute ``positions`` when they are first read from a result of :meth:`after`; reject unknown attributes."""
         ahead: tuple[PackedObstacles, float] | None = self.__dict__.get("_ahead")
         if name != "positions" or ahead is None:
             raise AttributeError(f"PackedObstacles has no attribute {name!r}")
@@ -254,12 +254,12 @@ def distances(packed: PackedObstacles, points: ArrayLike, times: ArrayLike | Non
 
     Args:
         packed: n obstacles at their reference time.
-        points: points in the base frame, shape (..., 3) [m]. With ``times``: the points at each time, shape (k, ...,
-            3), or (1, ..., 3) for points that do not move.
-        times: times after the obstacles' reference time, shape (k,) [s]; None: the reference time itself.
+        points: points in the base frame, shape (..., 3) [m]. If ``times`` is given, the points at each time, shape (k,
+            ..., 3), or shape (1, ..., 3) for points that do not move.
+        times: times counted from the obstacles' reference time, shape (k,) [s]; None: only the reference time.
 
     Returns:
-        Shape (n, ...) [m], or (n, k, ...) with ``times``; negative inside.
+        Distances, shape (n, ...) [m], or shape (n, k, ...) if ``times`` is given; negative inside.
 
     Raises:
         InputError: when a shape is wrong or a number is not finite.

@@ -35,8 +35,9 @@ def slabs(
     """Return distances to boxes, cylinders and half-spaces, all as rounded boxes of half size ``half``.
 
     With ``a = |q| - half`` the distance is ``|max(a, 0)| + min(max_j a_j, 0) - rounding``. A half-space is a box of
-    infinite size. A cylinder (``turned``) is a box in ``(rho, z)`` with ``rho^2 = x^2 + y^2``. If a scene contains
-    boxes, cylinders or half-spaces, its spheres are computed as rounded points and its capsules as rounded segments.
+    infinite size. A cylinder (``turned``) is a box in the coordinates ``(rho, z)`` with ``rho^2 = x^2 + y^2``. If a
+    scene contains boxes, cylinders or half-spaces, this function also computes its spheres, as rounded points, and its
+    capsules, as rounded segments.
 
     Args:
         q: points in the local frames, shape (3, ...) [m].
@@ -197,8 +198,8 @@ def cones(
 ) -> tuple[Array, Array | None]:
     """Return distances to cones: triangles in the half-plane ``(rho, z)``, base at ``-height/2``, tip at ``+height/2``.
 
-    Outside, the distance is the smaller of the distances to two segments, the slant side and the base; inside, it is
-    the larger of the signed distances to their lines.
+    Outside, the distance is the smaller of the distances to two segments: the slant side and the base. Inside, the
+    distance is the larger of the signed distances to the lines through these segments.
 
     Args:
         q: points in the local frames, shape (3, ...) [m].
@@ -248,12 +249,13 @@ CONES = Family(("cone",), cones, _prepare_cones)
 class Cone(PosedObstacle):
     """A circular cone whose tip points along its local z axis.
 
-    In the half-plane ``(rho, z)`` the cone is a triangle. Outside, the distance is the smaller of the distances to two
-    segments, the slant side and the base; inside, it is the larger of the signed distances to their lines.
+    In the half-plane ``(rho, z)``, the cone is a triangle. Outside, the distance is the smaller of the distances to the
+    slant side and to the base, which are segments. Inside, the distance is the larger of the signed distances to the
+    lines through these segments.
 
     Attributes:
-        pose: obstacle_to_base, on the axis at half the height (as for a cylinder): base at ``z = -height/2``, tip at
-            ``z = +height/2``.
+        pose: obstacle_to_base. The origin is on the axis at half the height, so the base is at ``z = -height/2`` and
+            the tip at ``z = +height/2``.
         radius: radius of the base [m].
         height: height from base to tip [m].
     """

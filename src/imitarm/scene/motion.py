@@ -32,10 +32,10 @@ _STEP = 1e-4  # [s] half of the interval over which velocities are differences
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A recorded motion, interpolated between its samples; the obstacle rests before the first and after the last.
+    """A recorded motion, interpolated between its samples; before the first and after the last, the obstacle rests.
 
     Attributes:
-        times: strictly increasing, shape (n,) [s].
+        times: strictly increasing times of the samples, shape (n,) [s].
         positions: shape (n, 3) [m].
         quaternions: quaternions wxyz, shape (n, 4); None for an obstacle that does not rotate.
 
@@ -68,10 +68,10 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class MovingScene:
-    """A scene in which some obstacles follow functions of time; the others keep their velocity.
+    """A scene in which some obstacles follow functions of time; all other obstacles keep their velocity.
 
     Attributes:
-        scene: all obstacles at ``scene.stamp``; obstacles without a motion start from there.
+        scene: all obstacles at ``scene.stamp``; obstacles without a motion start from these poses.
         motions: the motion of some obstacles, by index or by name.
 
     Raises:
@@ -103,7 +103,7 @@ class MovingScene:
             self.at(self.scene.stamp)
 
     def from_stamp(self) -> MovingScene:
-        """Return the same scene and motions on a clock that is 0 at the stamp of the scene."""
+        """Return this scene with its motions on another clock, which is 0 at the stamp of the scene."""
         begins = self.scene.stamp
         if begins == 0.0:
             return self
@@ -134,7 +134,7 @@ class MovingScene:
     def at(self, time: float) -> Scene:
         """Return the scene at ``time`` [s], with the velocities of the obstacles at that time.
 
-        If an obstacle follows a function, its velocity is computed from its displacement within 0.2 ms.
+        If an obstacle follows a function, its velocity is computed from its displacement in an interval of 0.2 ms.
         """
         time = finite_number(time, "MovingScene.at: time", "s")
         if not self._moved:

@@ -125,7 +125,7 @@ class Family(NamedTuple):
     Attributes:
         kinds: names of the shapes.
         formula: see above.
-        prepare: makes the parameters (..., n) from the kinds (n,) and sizes (n, 3) of n obstacles.
+        prepare: function that computes the parameters (..., n) from the kinds (n,) and sizes (n, 3) of n obstacles.
     """
 
     kinds: tuple[str, ...]
@@ -185,12 +185,12 @@ class Obstacle(ABC):
     ``x``; inside, it points from ``x`` to the nearest surface point; on the surface, it is the outward normal. Because
     the solids are convex, ``sd`` is convex. Between two points, ``sd`` changes by at most the distance between the
     points. The nearest surface point may not be unique, for example at the centre of a sphere. The gradient then refers
-    to one of the nearest points, which is always the same for the same input. To keep a distance ``r`` from an
-    obstacle, require ``sd(x) >= r``: no inflated copy is needed.
+    to one of the nearest points; the same input always gives the same point. To keep a distance ``r`` from an obstacle,
+    require ``sd(x) >= r``; no inflated copy of the obstacle is needed.
 
     Attributes:
         velocity: velocity of the shape's centre, in the base frame, shape (3,) [m/s].
-        name: name in messages; without a name, a :class:`~imitarm.scene.Scene` uses ``"box 1"``.
+        name: name in messages; an obstacle without a name is called, for example, ``"box 1"``.
         angular_velocity: angular velocity about the shape's centre, in the base frame, shape (3,) [rad/s].
         covariance: covariance of the position, shape (3, 3) [m^2]; None if the position is exact or the covariance is
             unknown.
@@ -372,7 +372,7 @@ class Obstacle(ABC):
         return placed
 
     def with_covariance(self, covariance: Array) -> Self:
-        """Return a copy of the obstacle with another covariance of its position, shape (3, 3) [m^2], which is valid."""
+        """Return a copy of the obstacle with another covariance of its position, shape (3, 3) [m^2], without checks."""
         copied = copy.copy(self)
         copied._set(covariance=covariance.copy())
         return copied

@@ -91,10 +91,10 @@ class Sphere(Obstacle):
         return Solid(self.kind, self.center, UPRIGHT, (self.radius, 0.0, 0.0))
 
     def signed_distance(self, points: ArrayLike) -> Array:
-        """Return the distance to the surface, as for every shape; a sphere needs no local frame.
+        """Return the distance to the surface; unlike other shapes, a sphere needs no local frame.
 
         Args:
-            points: in the base frame, shape (..., 3) [m].
+            points: points in the base frame, shape (..., 3) [m].
 
         Returns:
             Shape (...) [m].
@@ -175,9 +175,10 @@ def ellipsoids(q: Array, gradient: bool, semi_axes: Array, beyond: Array, floor:
 
     The surface point nearest to ``y`` is ``e_j = g_j^2 y_j / (t + g_j^2)`` with semi-axes ``g``, where ``t`` is the
     largest root of ``F(t) = sum_j (g_j y_j / (t + g_j^2))^2 - 1``. With ``s = t + min g^2`` the function ``h(s) = 1 /
-    sqrt(F + 1)`` is concave and increasing. Newton's method on ``h = 1`` from the left therefore never steps over the
-    root and needs no bracket. With the unit normal ``n`` at ``e`` the distance is ``n.y - sqrt(sum_j g_j^2 n_j^2)``. An
-    error in ``n`` has only a quadratic effect on the distance and never makes it too large.
+    sqrt(F + 1)`` is concave and increasing. If Newton's method for ``h = 1`` starts at the left of the root, it
+    therefore never steps over the root and needs no bracket. With the unit normal ``n`` at the surface point ``e``, the
+    distance is ``n.y - sqrt(sum_j g_j^2 n_j^2)``. An error in ``n`` has only a quadratic effect on the distance and
+    never makes it too large.
 
     Args:
         q: points in the local frames, shape (3, ...) [m].

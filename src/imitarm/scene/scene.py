@@ -31,8 +31,8 @@ class Scene:
         stamp: time for which the poses of the obstacles are valid [s]. For a scene from a sensor, ``stamp`` is the time
             of the measurement, from which :meth:`at` predicts.
         fixtures: objects on which the arm stands or works, such as floor, pedestal and table. Fixtures are part of a
-            simulated world and cause contacts. Planners keep no distance from fixtures, because a tool must reach its
-            table.
+            simulated world and cause contacts. Planners of a tool's path keep no distance from fixtures, because a tool
+            must reach its table.
 
     Raises:
         InputError: when ``goal`` is not a pose, an entry of ``obstacles`` is not an obstacle, or ``stamp`` is not a
@@ -53,7 +53,7 @@ class Scene:
 
     @classmethod
     def predicted(cls, seen: Scene, packed: PackedObstacles, stamp: float) -> Scene:
-        """Return ``seen`` with the obstacle poses of ``packed``, for code that moves obstacles itself.
+        """Return ``seen`` with the obstacle poses of ``packed``; code that moves obstacles itself needs this function.
 
         Args:
             seen: the scene from which the shapes, the goal and the fixtures are taken.
@@ -70,7 +70,7 @@ class Scene:
         return PackedObstacles.of(self.obstacles, self.stamp)
 
     def at(self, time: float) -> Scene:
-        """Return the scene as predicted for another time; only this method predicts the motion of obstacles.
+        """Return the scene as predicted for another time; all predictions of obstacles use this method.
 
         Each obstacle keeps its velocity and its angular velocity; the goal does not move. The result has ``stamp =
         time``; ``packed.stamps`` keeps the time at which each obstacle was seen. The prediction takes microseconds,

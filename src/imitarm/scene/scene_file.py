@@ -1,8 +1,8 @@
 """Scene files: a goal and obstacles in hand-written YAML (docs/scene.md).
 
-In the file, the keys of an obstacle are the fields of its shape's class, so a shape added to ``OBSTACLES`` can be read
-and written without further code. The reader accepts only plain YAML (numbers, text, lists and mappings) and never
-executes anything in a file.
+In the file, the keys of an obstacle are the fields of its shape's class. Therefore, a shape that is added to
+``OBSTACLES`` can be read and written without further code. The reader accepts only plain YAML (numbers, text, lists and
+mappings) and never executes anything in a file.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
         path: YAML file in the format of docs/scene.md.
 
     Returns:
-        The scene in metres, regardless of the file's units. An obstacle with a track has the pose and the velocity of
-        the track at the scene's stamp; :func:`load_moving_scene` returns the tracks too.
+        The scene in metres, regardless of the file's units. If an obstacle has a track, it gets the track's pose and
+        velocity at the scene's stamp; :func:`load_moving_scene` also returns the tracks.
 
     Raises:
         InputError: when there is no such file or it can't be read.
@@ -92,7 +92,7 @@ def load_moving_scene(path: str | os.PathLike[str]) -> MovingScene:
 
 
 def save_scene(scene: Scene | MovingScene, path: str | os.PathLike[str]) -> None:
-    """Write a scene file in metres that :func:`load_scene` or :func:`load_moving_scene` reads back to the last digit.
+    """Write a scene file in metres; :func:`load_scene` and :func:`load_moving_scene` read it back to the last digit.
 
     The text is written to a temporary file, which is then renamed, so an existing file survives a failure.
 

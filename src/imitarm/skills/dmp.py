@@ -47,18 +47,18 @@ _state = tuple.__new__  # makes a named tuple without its slower constructor
 
 
 class DMPState(NamedTuple):
-    """State of a primitive during a motion. ``DMP.begin`` creates it and ``DMP.step`` advances it.
+    """State of a movement primitive during a motion; ``DMP.begin`` creates a state and ``DMP.step`` advances it.
 
     Attributes:
         motion: [x; T x'], where T is the duration, shape (2, 3) [m].
-        fraction: elapsed fraction of the duration on the primitive's own clock; the phase is ``exp(-alpha
+        fraction: fraction of the duration that has elapsed on the primitive's own clock; the phase is ``exp(-alpha
             fraction)``.
         target: start, goal and duration of the motion.
         rotation: state of the rotation; None when no rotation was learned.
-        steps: if all steps so far have the same length, this length (as a fraction of the duration) and the number of
-            steps; otherwise None.
-        checked: the ``motion`` array that is known to be finite; None before a check. A step checks only states
-            that the caller changed, not the state that the previous step returned.
+        steps: length of a step, as a fraction of the duration, and number of steps so far; None if the steps differ in
+            length.
+        checked: the last ``motion`` array that was checked to be finite; None before a check. A step thus checks only a
+            state that the caller changed.
     """
 
     motion: Array
@@ -80,7 +80,7 @@ class DMPState(NamedTuple):
 
     @property
     def phase(self) -> float:
-        """Phase s: 1 at the start, 0.01 at the end, and then decaying to 0."""
+        """Phase s: 1 at the start and 0.01 at the end; afterwards, it decays to 0."""
         return float(np.exp(-DECAY * self.fraction))
 
     @property
@@ -102,33 +102,35 @@ class DMP:
 
         f(s) &= \frac{\sum_i w_i \psi_i(s) s}{\sum_i \psi_i(s)}, \quad \psi_i(s) = \exp(-h_i (s - c_i)^2)
 
-    This form replaces thesis Eqs 2.8 to 2.12, which scale the force by g - x_0 and therefore fail for an axis that does
-    not move. Because tau is the duration, K and D have no unit. The ``"critical"`` gains have D = 2 sqrt(K). The
-    ``"thesis"`` gains K = 139.26, D = 28 have a damping ratio of 1.186. The first equation can also be read as a spring
-    and damper that follow the moving target ``y(s) = g + f(s) + (x_0 - g) s``, which ends at the goal.
+    Here, x is the position, x_0 the start, g the goal and s the phase. The time constant tau is the duration, so K and
+    D have no unit. This form replaces thesis Eqs 2.8 to 2.12. Those equations scale the force by g - x_0, and therefore
+    fail for an axis that does not move. The ``"critical"`` gains have D = 2 sqrt(K). The ``"thesis"`` gains K = 139.26,
+    D = 28 have a damping ratio of 1.186. The first equation also describes a spring and damper that follow the moving
+    target ``y(s) = g + f(s) + (x_0 - g) s``, which ends at the goal.
 
     **Fitting** (:func:`~imitarm.skills.dynamical_systems.fit_weights`) is ridge regression on the positions. Measured
-    positions are not differentiated, samples may have any times, and the motion reaches the goal at the end of the
-    duration.
+    positions are not differentiated, and the samples need not be evenly spaced in time. The motion reaches the goal at
+    the end of the duration.
 
     **Another start or goal**: let ``p`` be the fraction of the path that has been travelled. A second primitive, which
-    moves from 0 to 1 with the weights w_p, computes this fraction. The argument ``adjustment`` then selects the
-    weights:
+    moves from 0 to 1 with the weights w_p, computes this fraction.
+    The argument ``adjustment`` selects the weights of the new motion:
 
-    * ``"progress"``: w + (change of g - x_0) w_p. The change of start and goal is added in proportion to the travelled
-      path. The motion therefore rests where the demonstration rests, does not reverse when the distance is halved, and
-      needs no special treatment for an axis without motion.
-    * ``"hoffmann"``: the learned w, unchanged, as in the published method. The change of start and goal is added as
-      fast as the spring allows.
-    * ``"rotodilatation"``: w is rotated and stretched like g - x_0 (Ginesi et al. 2019), so the shape scales.
+    * ``"progress"``: the weights are w + delta w_p, where delta is the change of g - x_0. The change of start and goal
+      is thus added in proportion to the travelled path. The motion therefore rests where the demonstration rests, and
+      does not reverse when the distance to the goal is halved. An axis without motion needs no special treatment.
+    * ``"hoffmann"``: the weights are the learned w, as in the published method. The change of start and goal then takes
+      effect as fast as the spring allows.
+    * ``"rotodilatation"``: the weights w are rotated and scaled in the same way as g - x_0 (Ginesi et al. 2019), so the
+      whole shape of the path is rotated and scaled.
 
-    **Integration.** The integration is exact for a target that is a parabola within each 1/200 of the duration.
-    Therefore ``step`` and ``generate`` agree, and the path and its end do not depend on the step length.
+    **Integration.** The integration is exact if the target is a parabola within each two-hundredth of the duration.
+    Therefore ``step`` and ``generate`` agree, and the path does not depend on the step length.
 
     Args:
         gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains`.
         n_basis: number N of basis functions.
-        regularisation: regularisation of the ridge regression, relative to the mean square response of a basis
+        regularisation: weight of the penalty in the ridge regression, relative to the mean square response of a basis
             function.
 
     Attributes:
@@ -166,9 +168,9 @@ class DMP:
 
         Args:
             trajectory: the motion to reproduce.
-            exact_ends: whether to start and end exactly at the first and the last sample and rotation. If False, a
-                first or last sample that is more than 0.1 mm away from the path that fits all samples counts as noise,
-                and the motion starts or ends on that path instead.
+            exact_ends: whether to start and end exactly at the first and the last sample. If False, a first or last
+                sample may count as noise, because it is more than 0.1 mm away from the path that fits all samples. The
+                motion then starts or ends on this path.
 
         Raises:
             InputError: when the trajectory has fewer than 3 samples.
@@ -269,10 +271,11 @@ class DMP:
 
         Args:
             start: a Pose, or a position (3,) [m] with the learned rotation; None: as learned.
-            goal: likewise.
+            goal: a Pose, or a position (3,) [m] with the learned rotation; None: as learned.
             duration: duration of the motion [s]; None: the learned one.
-            start_velocity: start velocity (3,) [m/s]; None: the learned one, scaled with the duration.
-            adjustment: how the motion is changed for another start and goal, see the class.
+            start_velocity: start velocity (3,) [m/s]; None: the learned start velocity, scaled with the duration.
+            adjustment: name of the method that changes the motion for another start and goal; the class describes the
+                methods.
 
         Raises:
             InputError: when not fitted, a shape is wrong, or the duration is not above 0.
@@ -306,13 +309,14 @@ class DMP:
 
         Args:
             state: state returned by :meth:`begin` or by the last step.
-            dt: [s], above 0.
+            dt: length of the step [s], above 0.
             goal: new goal position (3,) [m], which applies from this step on; None: the goal stays.
             coupling: function from position (3,) [m] and velocity (3,) [m/s] to an acceleration (3,) [m/s^2] that is
                 added during this step, for example away from an obstacle. If ``coupling`` returns six numbers, the last
                 three are an angular acceleration [rad/s^2].
-            measured: measured position of the robot (3,) [m]. The primitive's clock slows down by
-                ``1 / (1 + |lag| / patience)`` (phase stopping), so that the primitive waits for a robot that lags.
+            measured: measured position of the robot (3,) [m]. The lag is the distance between this position and the
+                primitive's own position. The primitive's clock slows down by the factor ``1 / (1 + lag / patience)``
+                (phase stopping), so the primitive waits for a robot that lags behind.
             patience: lag at which the primitive's clock runs at half speed [m].
 
         Raises:
@@ -370,8 +374,8 @@ class DMP:
     ) -> Trajectory:
         """Return the whole motion, ``round(duration / dt) + 1`` samples from 0 s to ``duration``.
 
-        The step is ``dt``, stretched so that a whole number of steps fills the duration. Without ``coupling`` all
-        samples are computed at once.
+        The length of a step is ``dt``, adjusted so that a whole number of steps fills the duration. Without
+        ``coupling``, all samples are computed at once.
 
         Args:
             start: see :meth:`begin`.

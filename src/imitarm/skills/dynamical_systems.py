@@ -37,7 +37,7 @@ _NOISE = 1e-4  # [m] the repeatability of industrial arms
 
 @dataclass(frozen=True)
 class PhaseBasis:
-    r"""Basis functions over the phase s, which decays from 1 to 0.01 during the motion and then to 0.
+    r"""Basis functions of the phase s; the phase decays from 1 to 0.01 during the motion, and afterwards to 0.
 
     .. math::
         \tau \dot s = -\alpha s, \qquad b_i(s) = \frac{\psi_i(s) s}{\sum_j \psi_j(s)}, \qquad
@@ -91,7 +91,7 @@ def basis_on_grid(n_basis: int, n_steps: int) -> tuple[Array, Array]:
 
 
 class Gains(NamedTuple):
-    """Stiffness and damping of ``tau^2 x'' = K (y - x) - D tau x'``. Because tau is the duration, K and D have no unit.
+    """Stiffness K and damping D of the spring ``tau^2 x'' = K (y - x) - D tau x'`` with the target y.
 
     Attributes:
         stiffness: K.
@@ -103,7 +103,7 @@ class Gains(NamedTuple):
 
     @property
     def damping_ratio(self) -> float:
-        """Damping ratio ``D / (2 sqrt(K))``: 1 is critical damping; above 1 the spring is overdamped, hence slower."""
+        """Damping ratio ``D / (2 sqrt(K))``: 1 is critical damping; a larger ratio makes the spring slower."""
         return float(self.damping / (2.0 * np.sqrt(self.stiffness)))
 
     @classmethod
@@ -112,7 +112,7 @@ class Gains(NamedTuple):
 
         Args:
             gains: a name in ``GAINS``, or stiffness and damping.
-            what: name of the class that uses the gains, for messages.
+            what: name of the class that uses the gains; error messages begin with it.
 
         Raises:
             UnknownNameError: when there are no gains of that name.
@@ -135,14 +135,14 @@ class Propagator(NamedTuple):
     """One step of the spring: ``z_next = transition @ z + drive @ [y_0; ...; y_2m]``, with z = [x; tau x'].
 
     The step is divided into m equal parts, and the target ``y`` is given at the beginning, middle and end of each part.
-    The integration over a part is exact if the target is a parabola within the part, so the error falls with the fourth
-    power of the part's length. A part is at most 1/200 of the duration, and at most a fifth of the distance between two
-    basis functions.
+    The integration over a part is exact if the target is a parabola within the part. For other targets, the error
+    decreases with the fourth power of the part's length. A part is at most 1/200 of the duration, and at most a fifth
+    of the distance between two basis functions.
 
     Attributes:
         transition: transition matrix, shape (2, 2).
         drive: drive matrix, shape (2, 2 m + 1).
-        push: change of z during the step if ``tau^2 x''`` is increased by 1, shape (2,).
+        push: change of z during the step that an additional force of 1 in ``tau^2 x''`` causes, shape (2,).
         instants: times at which the target is needed, shape (2 m + 1,). They are counted from the start of the step, in
             fractions of the motion's duration.
     """
@@ -193,14 +193,14 @@ def targets_by_step(step: Propagator, target: Array) -> Array:
 
 
 def roll_out(step: Propagator, start: Array, target: Array) -> Array:
-    """Return the states after all steps, computed at once.
+    """Return the states after each of n steps, all computed at once.
 
-    The recursion ``z_k = E z_(k-1) + q_k`` is summed by doubling. After j passes, each state holds the sum of its last
-    2^j terms, so n steps take log2(n) passes over whole arrays.
+    The recursion is ``z_k = E z_(k-1) + q_k``. Each pass over the arrays doubles the number of terms that every state
+    contains. After j passes, a state contains its last 2^j terms, so n steps need log2(n) passes.
 
     Args:
-        step: one of n equal steps.
-        start: [x; tau x'] at the beginning, shape (2, C).
+        step: propagator of one of the n equal steps.
+        start: [x; tau x'] at the beginning, for C coordinates, shape (2, C).
         target: y at the ``instants`` of all n steps, in the order of time, shape (2 n m + 1, C).
 
     Returns:
@@ -221,7 +221,7 @@ def roll_out(step: Propagator, start: Array, target: Array) -> Array:
 
 
 class PlannedSteps(NamedTuple):
-    """All steps of a motion with one step length, computed in advance.
+    """All steps of a motion that have the same length, computed in advance.
 
     Attributes:
         transition: transition matrix of one step, shape (2, 2).
@@ -242,8 +242,8 @@ class MovingTarget:
         start: x_0, position (3,) [m].
         goal: g, position (3,) [m].
         duration: duration of the motion [s].
-        adjustment: how the learned motion is changed for another start and goal.
-        drive: w - (g - x_0), with the weights w adjusted to this start and goal, shape (N, 3) [m].
+        adjustment: name of the method that changes the learned motion for another start and goal, see ``DMP``.
+        drive: w - (g - x_0), where the weights w are adjusted to this start and goal, shape (N, 3) [m].
     """
 
     start: Array
@@ -262,11 +262,11 @@ class MovingTarget:
         return np.asarray(self.goal + basis_on_grid(len(self.drive), n_steps)[1] @ self.drive)
 
     def plan(self, gains: Gains, step: float) -> PlannedSteps | None:
-        """Return the plan of a whole motion in steps of length ``step`` [fraction of the duration], or None.
+        """Return the plan of a whole motion in steps of length ``step`` (fraction of the duration), or None.
 
-        The target does not depend on the state, so a plan can be computed once and used in all steps. If the goal
-        moves, the target changes at every step, and a plan that is used only once would be a waste. The first call with
-        a step length therefore returns None, and the second call computes the plan.
+        The target does not depend on the state, so one plan serves all steps. If the goal moves, however, the target
+        changes at every step, and a plan would be used only once. The first call with a step length therefore returns
+        None, and only the second call computes the plan.
         """
         if step not in self._plans:
             self._plans[step] = None
@@ -335,26 +335,27 @@ def fit_weights(
 ) -> FittedWeights:
     r"""Return the weights with which the primitive reproduces a path.
 
-    The motion is linear in ``d_i = w_i - (g - x_0)``. Let R be the responses of the spring to a unit start position, a
-    unit start velocity, a unit goal and each basis function. Then ``x(t) = R_start x_0 + R_rate v_0 + R_goal g + sum_i
-    d_i R_i``. The usual regression compares forces (such as ``tau v' + D v``) and needs measured accelerations. This
-    function compares positions: the response of the spring to each basis function with the path. Therefore noise is not
-    differentiated, the samples may have any times, and the regression minimises the error of the reproduction in
-    metres.
+    The motion is linear in ``d_i = w_i - (g - x_0)``. Let R be the responses of the spring: to a start position of 1,
+    to a start velocity of 1, to a goal of 1, and to each basis function. Then ``x(t) = R_start x_0 + R_rate v_0 +
+    R_goal g + sum_i d_i R_i``. The usual regression fits forces (such as ``tau v' + D v``) and needs measured
+    accelerations. This function instead fits the positions x(t) to the path. Therefore noise is not differentiated, and
+    the samples need not be evenly spaced in time. The regression minimises the position error of the reproduced motion
+    in metres.
 
-    The motion passes exactly through its start and its goal. Start and goal are the first and the last sample. If noise
-    moves one of these samples more than 0.1 mm away from the path that fits all samples, the end of this path is used
-    instead. A motion that is forced through a noisy sample would have a high jerk there. If the argument ``exact_ends``
-    is True, the samples themselves are used. The last ``d_i`` is set to 0, so that the target is the goal when the
-    duration is over. (The regression hardly determines the last ``d_i``. A last ``d_i`` other than 0 can pull the tool
-    decimetres away from the goal after the end of the motion.)
+    The motion passes exactly through its start and its goal. Start and goal are the first and the last sample. Noise
+    may move one of these samples more than 0.1 mm away from the path that fits all samples. A motion that is forced
+    through such a sample would have a high jerk. The end of the fitted path is then used instead, unless ``exact_ends``
+    is True. The last ``d_i`` is set to 0, so that the target equals the goal at the end of the duration. (The
+    regression hardly determines the last ``d_i``. Another value could pull the tool decimetres away from the goal after
+    the end of the motion.)
 
     Args:
         fraction: fraction of the duration, from 0 to 1, shape (n,).
         x: positions, shape (n, 3) [m].
         gains: gains of the spring.
         n_basis: number N of basis functions.
-        regularisation: regularisation of the ridge regression, relative to the mean square response.
+        regularisation: weight of the penalty in the ridge regression, relative to the mean square response of a basis
+            function.
         exact_ends: whether to use the first and the last sample without smoothing.
     """
     responses = _responses(gains, n_basis)

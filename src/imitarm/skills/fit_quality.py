@@ -30,7 +30,7 @@ class PoorFitWarning(UserWarning):
 
 @dataclass(frozen=True)
 class DemonstrationDistance:
-    """Distance between a skill's nominal path and one demonstration, at the same times.
+    """Distance between a skill's nominal path and one demonstration at equal times.
 
     Attributes:
         source: the source of the demonstration.
@@ -49,7 +49,7 @@ class DemonstrationDistance:
 
 @dataclass(frozen=True)
 class FitQuality:
-    """How well a skill fits its demonstrations.
+    """Measures of how well a skill fits its demonstrations.
 
     The bias is the root mean square distance between the skill and the average of the demonstrations at the same times.
     Differences between demonstrations do not count as bias; they are the skill's tolerance. A skill with a bias above 5

@@ -31,12 +31,12 @@ class DegenerateAxisWarning(UserWarning):
 
 
 def ellipsoid_scale(probability: float, n_dims: int) -> float:
-    """Return the semi-axis, in standard deviations, of the ellipsoid that contains ``probability`` of a Gaussian.
+    """Return the semi-axis of the ellipsoid that contains ``probability`` of a Gaussian, in standard deviations.
 
     The squared Mahalanobis distance of a Gaussian in ``n_dims`` dimensions has a chi-square distribution with
-    ``n_dims`` degrees of freedom. The semi-axes are therefore ``scale * sqrt(eigenvalue)`` with the scale 1.960, 2.448,
-    2.796 for 95 % in 1, 2, 3 dimensions. The one-dimensional factor 1.960 would give an ellipse with only 85 % of a
-    Gaussian in the plane, and an ellipsoid with only 72 % in space.
+    ``n_dims`` degrees of freedom. The semi-axes are therefore ``scale * sqrt(eigenvalue)``. For 95 %, the scale is
+    1.960, 2.448 or 2.796 in 1, 2 or 3 dimensions. With the one-dimensional scale 1.960, an ellipse in the plane would
+    contain only 85 % of the Gaussian, and an ellipsoid in space only 72 %.
 
     Raises:
         InputError: when ``probability`` is not in [0, 1) or ``n_dims`` is below 1.
@@ -58,24 +58,24 @@ class GaussianMixture:
         N_k = \sum_n h_k(z_n), \quad \pi_k = N_k / N, \quad \mu_k = \frac{1}{N_k} \sum_n h_k z_n, \quad
         \Sigma_k = \frac{1}{N_k} \sum_n h_k z_n z_n^T - \mu_k \mu_k^T
 
-    (thesis 2.2.1). Names follow scikit-learn. The differences:
+    (thesis 2.2.1). The names follow scikit-learn. This class differs from scikit-learn as follows:
 
     * Columns are standardised internally, so the result does not depend on the units.
     * ``init="time"`` starts from the best division of column 0 into K segments
       (:func:`~imitarm.skills.mixture_fitting.responsibilities_by_segments`). This start is deterministic and is meant
       for samples [t; x].
-    * A constant column (such as z in a planar task) does not influence the other columns. Such a column is listed in
-      ``degenerate_axes_`` and reported by a :class:`DegenerateAxisWarning`.
+    * A constant column (such as z in a planar task) does not influence the other columns. ``degenerate_axes_`` lists
+      such columns, and a :class:`DegenerateAxisWarning` reports them.
 
     Args:
         n_components: number K of Gaussians.
         reg_covar: smallest eigenvalue of a covariance, relative to the variances of the columns.
         n_init: number of starts; the best fit is kept. All starts except the first use k-means++ seeds.
         init: method for the first start: ``"time"`` (segments of column 0) or ``"kmeans++"``.
-        min_std: smallest standard deviation of a column [the column's unit] that counts as motion, one number or one
-            per column. A constant column is given this standard deviation.
+        min_std: smallest standard deviation with which a column counts as moving, in the column's unit; one number for
+            all columns or one for each. A constant column is given this standard deviation.
         random_state: seed of the k-means++ starts.
-        tol: stop when the mean log-likelihood per sample changes by less than this.
+        tol: the iterations stop when the mean log-likelihood per sample changes by less than this.
         max_iter: largest number of iterations of one start.
 
     Attributes:
@@ -223,12 +223,12 @@ class GaussianMixture:
         return self._normalised(self._checked(X, "predict_proba"))[0].T
 
     def predict(self, X: ArrayLike) -> NDArray[np.intp]:
-        """Return the component with the largest responsibility for each sample of ``X`` (n, d), shape (n,)."""
+        """Return, for each sample of ``X`` (n, d), the index of the component with the largest responsibility, (n,)."""
         return np.argmax(self.predict_proba(X), axis=1)
 
     @property
     def n_parameters(self) -> int:
-        """Number of free parameters: K - 1 priors, K means, K symmetric covariances, without the constant columns."""
+        """Number of free parameters, without constant columns: K - 1 priors, K means and K symmetric covariances."""
         K, d = self.n_components, self.means_.shape[1] - len(self.degenerate_axes_)
         return K - 1 + K * d + K * d * (d + 1) // 2
 
@@ -250,7 +250,7 @@ class GaussianMixture:
             random_state: seed.
 
         Returns:
-            Samples (n_samples, d), and the component of each (n_samples,).
+            Samples (n_samples, d), and the index of each sample's component (n_samples,).
 
         Raises:
             InputError: when not fitted, or an argument is not a whole number in range.

@@ -48,8 +48,8 @@ class GMR:
     r"""Gaussian mixture regression over time, of positions and rotations.
 
     A :class:`~imitarm.skills.gmm.GaussianMixture` is fitted to all samples z = [t; x] of all demonstrations. The
-    regression then conditions this mixture on t, as in thesis Eq 2.6, whose printed version lacks the responsibilities
-    :math:`h_k`:
+    regression then conditions this mixture on t (thesis Eq 2.6; the printed equation lacks the responsibilities
+    :math:`h_k`):
 
     .. math::
         \beta_k = \Sigma_k^{xt} / \Sigma_k^{tt}, \quad
@@ -62,32 +62,35 @@ class GMR:
         \hat\Sigma(t) = \sum_k h_k \left( S_k + (m_k - \hat x)(m_k - \hat x)^T \right)
 
     If the demonstrations have quaternions, x has six columns: the position [m] and a rotation vector [rad] relative to
-    a reference rotation (:class:`~imitarm.skills.rotations.RotationReference`). If the tool rotates far, the
-    reference moves with the tool.
+    a reference rotation (:class:`~imitarm.skills.rotations.RotationReference`). If the tool rotates far, the reference
+    rotates with the tool.
 
-    Times are counted from the first sample. Outside the demonstrated time span, the regression returns its value at the
-    nearest end of the span, because extrapolated linear pieces would drift away.
+    Times are counted from the first sample. For times outside the demonstrated span, the regression returns its value
+    at the nearest end of the span, because an extrapolation would drift away.
 
     Args:
-        n_components: number K of Gaussians, or ``"auto"``: the smallest K that reproduces held-out demonstrations as
-            well as any other and has little bias, see :func:`~imitarm.skills.mixture_fitting.choose`.
-        candidates: the numbers that ``"auto"`` tries; None: 2 to 16, and more while the bias is large.
+        n_components: number K of Gaussians, or ``"auto"``. ``"auto"`` takes the smallest K with a small bias that
+            reproduces held-out demonstrations as well as any other K, see
+            :func:`~imitarm.skills.mixture_fitting.choose`.
+        candidates: the numbers of Gaussians that ``"auto"`` tries; None: 2 to 16, and larger numbers as long as the
+            bias is large.
         reg_covar: see :class:`~imitarm.skills.gmm.GaussianMixture`.
         n_init: see :class:`~imitarm.skills.gmm.GaussianMixture`.
-        min_std: smallest standard deviations that count as motion (position [m], rotation [rad]).
+        min_std: smallest standard deviations with which an axis counts as moving (position [m], rotation [rad]).
         random_state: seed of the additional starts when ``n_init`` is above 1.
 
     Attributes:
         n_components_: number K of Gaussians.
-        selection_: results of ``"auto"``, one entry per number of components; empty when the number was given.
-        duration_: demonstrated duration [s]; the median when the demonstrations differ.
+        selection_: results of ``"auto"``, one entry for each number of components; empty if ``n_components`` was a
+            number.
+        duration_: demonstrated duration [s]; the median if the demonstrations have different durations.
         n_demonstrations_: number of demonstrations.
         has_orientation_: whether rotations were learned.
         weights_: priors, shape (K,).
         means_: means of [t; x], shape (K, 1 + D), D = 3 or 6.
         covariances_: covariances of [t; x], shape (K, 1 + D, 1 + D).
         reference_: the reference of the rotation vectors; None without rotations.
-        ends_: mean start and mean goal of the demonstrations, as x (position, rotation vector), shape (2, D).
+        ends_: mean start and mean goal of the demonstrations, as rows x (position, rotation vector), shape (2, D).
         degenerate_axes_: indices of the constant columns of x; 0 to 2 are the position, 3 to 5 the rotation vector.
         converged_: whether the fit converged.
         lower_bound_: mean log-likelihood per sample.
@@ -308,15 +311,15 @@ class GMR:
         return mean + self._center[:n_columns], covariance
 
     def predict(self, times: ArrayLike) -> tuple[Array, Array]:
-        """Return mean position (n, 3) [m] and its covariance (n, 3, 3) [m^2] at ``times`` (n,) [s]."""
+        """Return the mean position (n, 3) [m] and its covariance (n, 3, 3) [m^2] at ``times`` (n,) [s]."""
         return self._regress(self._clamped(times), 3)
 
     def predict_orientation(self, times: ArrayLike) -> tuple[Array, Array]:
         """Return the mean rotation and its covariance at ``times`` (n,) [s].
 
         Returns:
-            Quaternions wxyz (n, 4), and covariance (n, 3, 3) [rad^2] of the small rotation, in the base frame, from the
-            mean rotation to a demonstrated rotation.
+            Quaternions wxyz (n, 4), and covariance (n, 3, 3) [rad^2] of the small rotation from the mean rotation to a
+            demonstrated rotation, in the base frame.
 
         Raises:
             InputError: when the demonstrations had no quaternions.
@@ -355,12 +358,13 @@ class GMR:
             \bar x(t) = \hat x(t) + b(t / w_1) (x_{start} - \hat x(0)) + b((T - t) / w_K) (x_{goal} - \hat x(T)), \quad
             b(u) = 1 - 10 u^3 + 15 u^4 - 6 u^5
 
-        The widths :math:`w_1 = \mu_1^t` and :math:`w_K = T - \mu_K^t` reach from the ends to the centres of the first
-        and the last Gaussian; they are at least a twentieth of the duration. The correction depends only on time, so
-        moving the mean of Gaussian k by :math:`\Delta_k` still moves the path by :math:`h_k(t) \Delta_k`.
+        The correction at the start lasts until the centre of the first Gaussian, :math:`w_1 = \mu_1^t`. The correction
+        at the goal begins at the centre of the last Gaussian, so :math:`w_K = T - \mu_K^t`, where T is the duration.
+        Both widths are at least a twentieth of the duration. The correction depends only on time, so moving the mean of
+        Gaussian k by :math:`\Delta_k` still moves the path by :math:`h_k(t) \Delta_k`.
 
         Returns:
-            Positions (n, 3) [m], and quaternions wxyz (n, 4), None without rotations.
+            Positions (n, 3) [m] and quaternions wxyz (n, 4); None instead of quaternions if no rotations were learned.
         """
         t = self._clamped(times)
         x = self._regress(t, self.means_.shape[1] - 1)[0] + self._end_correction(t)

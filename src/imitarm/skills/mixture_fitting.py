@@ -4,17 +4,17 @@ The logarithm of a weighted Gaussian is linear in the quadratic features ``phi(z
 
     log pi_k N(z; mu_k, Sigma_k) = theta_k . phi(z)
 
-Therefore, one matrix product, ``theta @ phi``, computes all log-densities, and a second matrix product,
-``responsibilities @ phi^T``, all sufficient statistics, without a loop over components or samples. Written as a
-symmetric matrix M, the statistics of one component are the second moments of ``[1; z]``. The inverse of M contains all
-parts of ``theta_k`` (``P = Sigma^-1``)::
+Therefore, one matrix product, ``theta @ phi``, computes all log-densities. A second matrix product, ``responsibilities
+@ phi^T``, computes all sufficient statistics. No loop over components or samples is needed. The statistics of one
+component form a symmetric matrix M, the second moments of ``[1; z]``. With ``P = Sigma^-1``, the inverse of M contains
+all parts of ``theta_k``::
 
     M = [1     mu^T             ]     M^-1 = [1 + mu^T P mu   -mu^T P]     det M = det Sigma
         [mu    Sigma + mu mu^T  ]            [-P mu            P     ]
 
-Fits that differ only in their start or in their samples (restarts, folds of a cross-validation) are computed together,
-as further rows of these two matrix products. The samples must be standardised (each column with mean 0 and standard
-deviation 1), so that the sums of squares are well conditioned.
+Several fits may differ only in their start (restarts) or in their samples (folds of a cross-validation). Such fits are
+computed together, as further rows of the two matrix products. The samples must be standardised (each column with mean 0
+and standard deviation 1), so that the sums of squares are well conditioned.
 """
 
 from __future__ import annotations
@@ -58,11 +58,12 @@ class Fit(NamedTuple):
 
     Attributes:
         weights: priors pi, shape (B, K).
-        moments: second moments of [1; z], the matrix M in the docstring of this module, shape (B, K, d + 1, d + 1).
+        moments: second moments of [1; z], which are the matrix M in the docstring of this module, shape (B, K, d + 1, d
+            + 1).
         theta: weights of the quadratic features, shape (B, K, F), F = (d + 1) (d + 2) / 2.
         log_likelihood: mean log-likelihood per sample at exactly these parameters, shape (B,).
         converged: whether the last change of ``log_likelihood`` was below the tolerance, shape (B,).
-        n_iter: number of iterations, the same for all fits.
+        n_iter: number of iterations, which is the same for all fits.
     """
 
     weights: Array
@@ -85,7 +86,7 @@ class Fit(NamedTuple):
 
 @cache
 def packing(size: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-    """Return the maps between a symmetric (size, size) matrix and its packed upper triangle.
+    """Return index arrays that convert between a symmetric (size, size) matrix and its packed upper triangle.
 
     Returns:
         Three arrays. The first array gives the index of each packed number in the flat matrix. The second array, of
@@ -179,14 +180,14 @@ def expectation_maximisation(
     tol: float,
     max_iter: int,
 ) -> Fit:
-    """Fit ``B`` mixtures side by side.
+    """Fit ``B`` mixtures at the same time.
 
     Args:
         features: :func:`quadratic_features` of the standardised samples, shape (F, n).
         responsibilities: initial responsibilities, shape (B, K, n).
         sample_weights: weight of each sample in each fit, shape (B, n); 0 excludes the sample. None: all 1.
-        floor: smallest eigenvalue of a covariance, in squared standard deviations of the columns.
-        tol: stop when, in every fit, the mean log-likelihood per sample changes by less than this.
+        floor: smallest permitted eigenvalue of a covariance, in squared standard deviations of the columns.
+        tol: the iterations stop when the mean log-likelihood per sample changes by less than this in every fit.
         max_iter: largest number of iterations.
     """
     fraction = None if sample_weights is None else sample_weights / sample_weights.sum(axis=1, keepdims=True)
@@ -206,13 +207,13 @@ def expectation_maximisation(
 
 
 def responsibilities_by_segments(features: Array, column: Array, numbers: Sequence[int]) -> list[Array]:
-    """Divide time into the K segments that are described best by one Gaussian each, for several K at once.
+    """Divide time into K segments, each of which one Gaussian describes as well as possible, for several K at once.
 
     The range of ``column`` is divided into equal slots. The cost of a segment with n of the N samples and covariance
     Sigma is ``n (log det Sigma / 2 - log(n / N))``, its negative log-likelihood under a separate Gaussian. A small cost
-    for the squared length of each segment is added, which makes the lengths equal where the data allow it. Dynamic
-    programming over the slots finds the cheapest division for every K up to the largest. The result is deterministic.
-    When EM starts from this result, it converges in fewer iterations than from equal bins.
+    for the squared length of each segment is added. This cost makes the lengths equal if the samples do not determine
+    them. Dynamic programming over the slots finds the cheapest division for every K up to the largest. The result is
+    deterministic. When EM starts from this result, it converges in fewer iterations than from equal bins.
 
     Args:
         features: :func:`quadratic_features` of the standardised samples, shape (F, n).
@@ -292,8 +293,8 @@ class Candidate:
         aic: Akaike's information criterion; lower is better.
         held_out_rmse_mm: root mean square distance between each demonstration and the mean learned from all other
             demonstrations [mm]; NaN with one demonstration.
-        bias_rmse_mm: distance between the learned mean and the average of the demonstrations at the same times, root
-            mean square [mm].
+        bias_rmse_mm: root mean square distance between the learned mean and the average of the demonstrations at equal
+            times [mm].
     """
 
     n_components: int
@@ -311,13 +312,13 @@ def choose(candidates: Sequence[Candidate]) -> int:
     * The held-out error of K is within 2 % (or 0.1 mm) of the smallest held-out error, so K generalises as well as any
       other number.
     * The bias of K is at most a tenth of the smallest held-out error (or 0.1 mm), so the bias is small compared with
-      the differences between demonstrations. The held-out error alone hardly shows a bias, because the squared bias is
-      added to much larger squared differences.
+      the differences between demonstrations. The second condition is necessary because the held-out error hardly shows
+      a bias. The square of this error is the sum of the squared bias and much larger squared differences.
 
-    If no K meets both conditions, only the K that meet the first condition are compared. Among these K, the result is
-    the smallest K whose bias exceeds the lowest bias by at most 10 %. BIC alone selects ever larger K for time series,
-    because neighbouring samples are not independent. BIC decides only if there is a single demonstration, because a
-    held-out error needs at least two demonstrations.
+    If no K meets both conditions, only the K that meet the first condition are compared. The result is the smallest of
+    these K whose bias exceeds the lowest bias by at most 10 %. A held-out error needs at least two demonstrations; with
+    a single demonstration, BIC decides. BIC is not used otherwise, because it prefers too large K for time series,
+    whose neighbouring samples are not independent.
     """
     ordered = sorted(candidates, key=lambda c: c.n_components)
     if any(np.isnan(c.held_out_rmse_mm) for c in ordered):
@@ -342,16 +343,16 @@ def try_numbers_of_components(
 ) -> tuple[Candidate, ...]:
     """Evaluate several numbers of components.
 
-    For each number, one fit uses all demonstrations, and each of the other fits leaves out one demonstration. These
-    fits run together, as rows of the same matrix products. Only a subset of the samples is used; the longer the
-    path, the more samples are used. For a pure rotation, errors are computed for a point 100 mm from the axis. The
-    search stops when four consecutive numbers of components do not reduce the held-out error by 0.5 %, and one of the
-    numbers meets both conditions of :func:`choose`.
+    For each number, one fit uses all demonstrations, and each further fit leaves out one demonstration. These fits are
+    computed together. They use only a subset of the samples, which is larger for a longer path. If the tool only
+    rotates, errors are computed for a point 100 mm from the axis. The search stops when four consecutive numbers of
+    components do not reduce the held-out error by 0.5 %, and one of the numbers meets both conditions of
+    :func:`choose`.
 
     Args:
         tables: samples [t, x, y, z, ...] of each demonstration, over the same span of time.
         numbers: numbers K of components to try.
-        min_std: smallest standard deviations that count as motion, one per column.
+        min_std: smallest standard deviation with which each column counts as moving, in the column's unit.
         reg_covar: smallest eigenvalue of a covariance relative to the variances of the columns.
         more: further numbers to try, in this order, while every bias so far is above 1 % of the motion's extent, or
             every learned path is shorter than 95 % of the motion.

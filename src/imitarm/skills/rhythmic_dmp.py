@@ -24,13 +24,13 @@ _CLOSES = 0.1  # of the extent: a motion that ends a period further than this fr
 
 
 class RhythmicDMPState(NamedTuple):
-    """State of a rhythmic primitive during a motion.
+    """State of a rhythmic movement primitive during a motion.
 
     ``RhythmicDMP.begin`` creates it and ``RhythmicDMP.step`` advances it.
 
     Attributes:
-        motion: [x; P x'] with the period P, shape (2, D): position [m], and the rotation vector [rad] where rotation
-            was learned.
+        motion: [x; P x'] with the period P, shape (2, D). The coordinates x are the position [m] and, if rotation was
+            learned, a rotation vector [rad].
         periods: number of periods since the start, phi / (2 pi).
         center: g, shape (D,).
         amplitude: r, the factor by which the learned motion is multiplied.
@@ -64,22 +64,22 @@ class RhythmicDMP:
         \psi_i(\phi) = \exp(h (\cos(\phi - c_i) - 1))
 
     Here, tau is the period, g the centre of the motion and r its amplitude. These equations are the rhythmic form of
-    Ijspeert et al. (2013). The weights come from ridge regression on the positions. The periodic response to each basis
-    function is known exactly, because the spring multiplies the Fourier coefficient at the k-th harmonic by ``K / (K -
-    (2 pi k)^2 + 2 pi k D i)``, where i is the imaginary unit. Rotations are represented by rotation vectors relative to
-    their mean rotation. All rotations must stay within 120 degrees of the mean.
+    Ijspeert et al. (2013). Ridge regression on the positions gives the weights. The spring's periodic response to each
+    basis function is known exactly, because the spring multiplies the k-th Fourier coefficient by ``K / (K - (2 pi k)^2
+    + 2 pi k D i)``, where i is the imaginary unit. Rotations are represented by rotation vectors relative to their mean
+    rotation. All rotations must stay within 120 degrees of the mean.
 
     Args:
         gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains`.
         n_basis: number N of basis functions in one period.
-        regularisation: regularisation of the ridge regression, relative to the mean square response of a basis
+        regularisation: weight of the penalty in the ridge regression, relative to the mean square response of a basis
             function.
 
     Attributes:
         gains_: stiffness and damping.
         weights_: weights of the basis functions, shape (N, D), D = 3, or 6 with rotation.
-        center_: g, shape (D,).
-        period_: learned [s].
+        center_: learned centre g of the motion, shape (D,) [m, rad].
+        period_: learned period [s].
         reference_: mean rotation; None when the demonstration had no quaternions.
 
     Raises:
@@ -169,11 +169,11 @@ class RhythmicDMP:
         """Return the state at phase 0.
 
         Args:
-            start: position of the tool at rest, from which the motion approaches the learned cycle. None: the motion
+            start: position of the resting tool, from which the motion approaches the learned cycle; None: the motion
                 begins on the learned cycle.
-            center: another centre of the positions (3,) [m]; None: the learned one.
+            center: centre of the motion's positions (3,) [m]; None: the learned centre.
             amplitude: factor by which the learned motion is multiplied.
-            period: period of the motion [s]; None: the learned one.
+            period: period of the motion [s]; None: the learned period.
 
         Raises:
             InputError: when not fitted, or an argument is out of range.
@@ -258,7 +258,7 @@ class RhythmicDMP:
 
         Args:
             duration: duration of the motion [s]; None: one period.
-            dt: step [s], stretched so that a whole number of steps fills the duration.
+            dt: length of a step [s], adjusted so that a whole number of steps fills the duration.
             start: see :meth:`begin`.
             center: see :meth:`begin`.
             amplitude: see :meth:`begin`.

@@ -45,11 +45,11 @@ _END_WEIGHT = 100.0  # the first and the last sample count so much more than the
 
 @dataclass(frozen=True, eq=False)
 class RotationReference:
-    """A reference rotation, fixed or moving, relative to which other rotations are represented as vectors.
+    """A fixed or moving reference rotation; other rotations are represented as rotation vectors relative to it.
 
     A rotation ``R`` near the reference ``R_ref(t)`` has the rotation vector ``r = log(R R_ref(t)^T)`` [rad] in the base
-    frame. A fixed reference suffices if all rotations are well within 180 degrees of it. A longer rotation needs a
-    moving reference, which is a normalised cubic spline through a few key quaternions.
+    frame. A fixed reference suffices if all rotations differ from the reference by clearly less than 180 degrees. A
+    longer rotation needs a moving reference, which is a normalised cubic spline through a few quaternions (the keys).
 
     Attributes:
         times: times of the keys [s], strictly increasing, shape (m,); a single key is a fixed reference.
@@ -107,8 +107,8 @@ class RotationReference:
     def among(cls, demonstrations: Sequence[tuple[Array, Array]]) -> RotationReference:
         """Return the simplest reference that is within 120 degrees of all demonstrated rotations.
 
-        The reference is the mean rotation if possible, otherwise a spline through the mean rotations at 5, 9, 17 or 33
-        times.
+        If possible, the reference is the mean rotation. Otherwise, it is a spline through the mean rotations at 5, 9,
+        17 or 33 instants.
 
         Args:
             demonstrations: times (n,) [s] on a common clock, and quaternions (n, 4) wxyz, of each demonstration.
@@ -139,7 +139,7 @@ class RotationReference:
 
 
 def left_jacobian(vectors: Array) -> Array:
-    """Return ``J`` (n, 3, 3) of rotation vectors r (n, 3) [rad]: ``exp(r + d) = exp(J d) exp(r)`` to first order in d.
+    """Return J (n, 3, 3) of rotation vectors r (n, 3) [rad], with ``exp(r + d) = exp(J d) exp(r)`` for small d.
 
     If ``Sigma`` is the covariance of r, then ``J Sigma J^T`` is the covariance of the small rotation in the base frame.
     """
@@ -158,9 +158,9 @@ class RotationState(NamedTuple):
     """State of the rotation during a motion.
 
     Attributes:
-        quaternion: wxyz, shape (4,).
-        offset: [r; T r'] with T the duration and r the rotation vector from the target to the rotation, in the base
-            frame, shape (2, 3) [rad]. Without a coupling, the offset is 0.
+        quaternion: rotation wxyz, shape (4,).
+        offset: [r; T r'], shape (2, 3) [rad]. T is the duration, and r is the rotation vector from the target to the
+            actual rotation, in the base frame. Without a coupling, the offset is 0.
         fraction: elapsed fraction of the duration.
         start_change: rotation vector (3,) [rad] from the learned start to the new start, in the base frame.
         goal_change: rotation vector (3,) [rad] from the learned goal to the new goal, in the base frame.
@@ -182,17 +182,17 @@ class QuaternionDMP:
     .. math::
         r = \log(R R_y(s)^T), \qquad \tau^2 \ddot r = -K r - D \tau \dot r + \tau^2 c
 
-    Here, c is an external angular acceleration. The logarithm is taken only of ``R R_y^T``, the rotation from the
-    target to ``R``, never of the rotation to the goal. Therefore a rotation by 270 degrees, or by three full
-    revolutions, is reproduced as demonstrated. (Formulations that use log(q_goal conj(q)) rotate in the opposite
-    direction beyond 180 degrees.) The target is a normalised cubic spline through quaternions with continuous signs.
-    For another start or goal, the target is rotated in the base frame by ``d_start`` at the start and by ``d_goal`` at
-    the goal. A minimum-jerk profile b blends these two rotations: ``exp((1 - b) d_start) exp(b d_goal) R_y``. Each of
-    the two is at most 180 degrees.
+    Here, c is an external angular acceleration. The logarithm is applied only to ``R R_y^T``, the rotation from the
+    target to ``R``, and never to the rotation to the goal. Therefore, the primitive can reproduce a rotation by 270
+    degrees, or by three full revolutions. (Formulations that use log(q_goal conj(q)) rotate in the opposite direction
+    beyond 180 degrees.) The target is a normalised cubic spline through quaternions with continuous signs. For another
+    start or goal, the target is rotated in the base frame by ``d_start`` at the start and by ``d_goal`` at the goal. A
+    minimum-jerk profile b, from 0 to 1, blends these two rotations: ``exp((1 - b) d_start) exp(b d_goal) R_y``. Both
+    ``d_start`` and ``d_goal`` are rotations by at most 180 degrees.
 
     Args:
         gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains`.
-        n_pieces: number of pieces of the spline; fewer when there are few samples.
+        n_pieces: largest number of pieces of the spline; if there are few samples, the spline has fewer pieces.
 
     Attributes:
         gains_: stiffness and damping.
@@ -307,7 +307,7 @@ class QuaternionDMP:
 
         Args:
             start: rotation wxyz (4,); None: as learned.
-            goal: likewise.
+            goal: rotation wxyz (4,); None: as learned.
 
         Raises:
             InputError: when not fitted, or a quaternion is not of length one.
@@ -374,7 +374,7 @@ def with_other_ends(quaternions: Array, fraction: Array, start_change: Array, go
 
 
 def rotodilatation(learned: Array, asked: Array, path_length: float) -> Array:
-    """Return the smallest rotation, times a scale factor, that maps ``learned`` to ``asked``, shape (3, 3).
+    """Return the scaled rotation matrix, with the smallest angle, that maps ``learned`` to ``asked``, shape (3, 3).
 
     The method follows Ginesi, Sansonetto and Fiorini (2019), "DMP++". If the learned motion ends near its start, its
     direction and length are undefined, and the result is the identity.

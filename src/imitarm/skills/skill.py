@@ -1,4 +1,4 @@
-"""A skill: a motion learned from demonstrations, and the precision that each part of it requires."""
+"""A skill: a motion learned from demonstrations, and the precision that each part of the motion requires."""
 
 from __future__ import annotations
 
@@ -35,24 +35,24 @@ class Skill:
     """A motion learned from demonstrations (thesis Chapter 5: GMM, then GMR, then DMP).
 
     A :class:`~imitarm.skills.gmr.GMR` learns the mean motion and its covariance, which shows how much the
-    demonstrations differ at each time. A :class:`~imitarm.skills.dmp.DMP` is trained on the nominal path (the mean
-    motion with exact start and goal): it can change the start, the goal and the duration of the motion. The covariance
-    is used as a tolerance: the robot must be precise where the person was precise. A skill is independent of obstacles;
-    policies handle them.
+    demonstrations differ at each time. A :class:`~imitarm.skills.dmp.DMP` is fitted to the nominal path (the mean
+    motion with exact start and goal). The DMP can change the start, the goal and the duration of the motion. The
+    covariance serves as a tolerance, because the robot must be precise where the person was precise. A skill does not
+    depend on obstacles; policies avoid them.
 
     The nominal path and the primitive start and end exactly at the means of the demonstrated starts and goals.
 
     Args:
         n_components: number of Gaussians, or ``"auto"`` (see GMR).
         gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains` (see DMP).
-        n_basis: number of basis functions of the primitive. ``"auto"`` chooses the smallest of 40, 80 and 160 with
-            which the primitive follows the nominal path within 0.1 mm or 0.2 % of the motion's extent (root mean
-            square).
+        n_basis: number of basis functions of the primitive. ``"auto"`` chooses the smallest of 40, 80 and 160 with a
+            small error. The root mean square distance between the primitive and the nominal path must be below 0.1 mm
+            or 0.2 % of the motion's extent.
         random_state: seed of all random choices in learning.
 
     Attributes:
         gmr_: mean and covariance over time.
-        dmp_: the primitive.
+        dmp_: the movement primitive.
         task_: name of the demonstrated task, for example ``"sweep"``.
         duration_: learned duration [s].
         start_: learned start, tool_to_base; its rotation is the identity when no rotation was learned.
@@ -91,11 +91,11 @@ class Skill:
     def fit(
         self, demonstrations: Sequence[Demonstration], *, notes: Sequence[str] = (), date: str | None = None
     ) -> Self:
-        """Learn from demonstrations that were aligned before (``imitarm.demonstrations.align``).
+        """Learn from demonstrations, which should be aligned first (``imitarm.demonstrations.align``).
 
         Args:
             demonstrations: at least one demonstration; three or more show how much the demonstrations vary.
-            notes: facts to keep with the skill, for example the findings of lint.
+            notes: texts that are saved with the skill, for example the findings of ``lint``.
             date: date of learning; None: the file contains no date, so that the same input gives the same file.
 
         Raises:
@@ -193,16 +193,17 @@ class Skill:
 
         The path starts and ends exactly at ``start`` and ``goal``, for any number of samples. The learned path is
         :meth:`~imitarm.skills.gmr.GMR.nominal`. Another start or goal changes the path in the same way as the
-        primitive's adjustment ``"progress"``:
+        adjustment ``"progress"`` of the movement primitive:
 
         .. math:: x(t) = \bar x(t) + (1 - p(t)) \delta_{start} + p(t) \delta_{goal}
 
-        Here, p is the fraction of the path that has been travelled. The rotation changes along a minimum-jerk profile.
+        Here, :math:`\bar x` is the learned path, p is the fraction of the path that has been travelled, and
+        :math:`\delta` are the changes of start and goal. The rotation changes along a minimum-jerk profile.
 
         Args:
             times: strictly increasing times from 0 to the learned duration, shape (n,) [s].
             start: a Pose, or a position (3,) [m] with the learned rotation; None: as learned.
-            goal: likewise.
+            goal: a Pose, or a position (3,) [m] with the learned rotation; None: as learned.
 
         Raises:
             InputError: when not fitted, or a start, a goal or a time is not valid.
@@ -232,10 +233,11 @@ class Skill:
 
         Args:
             start: a Pose, or a position (3,) [m] with the learned rotation; None: as learned.
-            goal: likewise.
-            duration: duration of the motion [s]; None: the learned one.
-            dt: step [s], stretched so that a whole number of steps fills the duration.
-            adjustment: how the motion is changed for another start or goal (see :class:`~imitarm.skills.dmp.DMP`).
+            goal: a Pose, or a position (3,) [m] with the learned rotation; None: as learned.
+            duration: duration of the motion [s]; None: the learned duration.
+            dt: length of a step [s], adjusted so that a whole number of steps fills the duration.
+            adjustment: name of the method that changes the motion for another start or goal (see
+                :class:`~imitarm.skills.dmp.DMP`).
 
         Raises:
             InputError: when not fitted, or an argument is out of range.
@@ -247,7 +249,7 @@ class Skill:
 
         Args:
             times: times since the start of a motion of length ``duration``.
-            duration: duration of the motion [s]; None: the learned one.
+            duration: duration of the motion [s]; None: the learned duration.
 
         Raises:
             InputError: when not fitted, or an argument is not valid.

@@ -1,10 +1,10 @@
 """The skill file: human-readable JSON. A skill file is checked when it is read, and nothing in it is ever executed.
 
-The file contains ``format``, ``version``, the meaning of the numbers (``units``, ``frames``), their origin (``task``,
-``provenance``), the numbers (``gmr``, ``dmp``, ``fit``), and last a ``checksum``. The checksum is the SHA-256 of
-everything else in canonical form (sorted keys, no spaces). The checksum therefore detects a change of any digit, but
-accepts a change of layout. Floats are written with all digits and are read back exactly. The classes below are the
-schema, which defines the content that is written and accepted.
+The file contains ``format`` and ``version``, the meaning of the numbers (``units``, ``frames``), and their origin
+(``task``, ``provenance``). Then come the numbers (``gmr``, ``dmp``, ``fit``) and a ``checksum``. The checksum is the
+SHA-256 of everything else in canonical form (sorted keys, no spaces). The checksum therefore detects the change of any
+digit, but accepts a different layout. Floats are written with all digits and are read back exactly. The classes below
+are the schema, which defines the content of the file.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class DmpFields(msgspec.Struct, omit_defaults=True):
 
 
 class FitFields(msgspec.Struct, omit_defaults=True):
-    """The attributes of a :class:`FitQuality`, with a row of distances for each source [m]."""
+    """The attributes of a :class:`FitQuality`; each source has a row of distances [m]."""
 
     distances: Table = msgspec.field(name="rms, largest, start, goal")
     extent: float

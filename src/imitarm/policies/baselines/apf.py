@@ -36,22 +36,22 @@ class APF(BaselinePolicy):
     r"""Classical artificial potential field (Khatib 1986; thesis 2.2.5, Eqs 2.15-2.22).
 
     The tool moves with the velocity ``F_a + F_r`` of :mod:`~imitarm.policies.baselines.potential_field`, from the start
-    to the goal. The learned path is not used: only its ends, its mean speed (which scales the attraction) and its
-    largest speed (which limits the velocity). The distance ``d`` is that of the tool's sphere, minus the required
-    clearance. A step that would increase the potential is halved, so that the tool does not oscillate between two
-    obstacles; among obstacles at rest, the potential never increases.
+    to the goal. The method uses only three properties of the learned path: its ends, its mean speed (which scales the
+    attraction) and its largest speed (which limits the velocity). The distance ``d`` is the distance from the tool's
+    sphere to the obstacle, minus the required clearance. A step that would increase the potential is halved, so that
+    the tool does not oscillate between two obstacles. Among obstacles at rest, the potential therefore never increases.
 
-    **Known failure.** The sum of the forces is also zero at local minima of the potential, for example in front of an
-    obstacle that stands between the tool and the goal, or beside a goal that is near an obstacle. The tool then stops,
-    and this method refuses: it can't leave the minimum.
+    **Known failure.** The sum of the forces is also zero at local minima of the potential. Such a minimum exists, for
+    example, in front of an obstacle between the tool and the goal, or beside a goal that is near an obstacle. At such a
+    minimum, the tool stops, and the method refuses the scene.
 
     Args:
         skill: skill that gives start, goal and speed.
         repulsion: k [m^4/s].
         influence: d_0 [m].
         cap: rho_c [m].
-        speed: speed far from goal and obstacles, divided by the mean speed of the learned motion; the attraction eta is
-            this speed divided by ``cap``.
+        speed: speed of the tool far from the goal and from obstacles, divided by the mean speed of the learned motion.
+            The gain ``eta`` of the attraction is the tool's speed there, divided by ``cap``.
         options: arguments of :class:`~imitarm.policies.path_policy.PathPolicy`.
     """
 

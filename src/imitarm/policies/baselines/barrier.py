@@ -56,19 +56,20 @@ def nearest_velocity(desired: Array, rows: Array, lower: Array) -> Array:
 class Barrier(VelocityField):
     r"""Follow the learned path by the nearest velocity that keeps the clearance.
 
-    With the gap ``h_o`` beyond the required clearance, the outward normal ``n_o`` and the velocity ``v_o`` of the
-    obstacle's closest point, the velocity solves::
+    Let ``u`` be the desired velocity and ``h_o`` the distance to obstacle ``o`` minus the required clearance. Let
+    ``n_o`` be the outward normal and ``v_o`` the velocity of the obstacle's closest point. The velocity ``v`` of the
+    tool solves::
 
         min |v - u|^2   s.t.   n_o . (v - v_o) >= -gamma h_o   for every obstacle o
 
-    ``h_o >= 0`` then holds at all times if it holds at the start: ``dh_o/dt = n_o . (v - v_o) >= -gamma h_o``. For
-    convex obstacles this is also true for time steps up to ``1 / gamma``, because the gap is a convex function of the
-    position. The filter looks only one step ahead: where the desired velocity points straight at an obstacle, the tool
-    stops in front of it.
+    If ``h_o >= 0`` at the start, then ``h_o >= 0`` at all times, because ``dh_o/dt = n_o . (v - v_o) >= -gamma h_o``.
+    For convex obstacles, ``h_o`` also stays positive with time steps of up to ``1 / gamma``, because the gap is a
+    convex function of the position. The filter looks only one step ahead: where the desired velocity points straight at
+    an obstacle, the tool stops in front of it.
 
     Args:
         skill: skill to reproduce.
-        gamma: how fast the tool may use up the gap [1/s].
+        gamma: largest rate at which the gap may shrink, divided by the gap [1/s].
         options: arguments of :class:`~imitarm.policies.baselines.velocity_field.VelocityField`.
     """
 
@@ -79,7 +80,7 @@ class Barrier(VelocityField):
         self.gamma = finite_number(gamma, "Barrier: gamma", "1/s", above=0.0)
 
     def velocity(self, desired: Array, around: NearObstacles, limits: Array) -> Array:
-        """Return the nearest velocity that keeps all gaps and all one-sided forbidden directions."""
+        """Return the velocity nearest to ``desired`` that keeps all gaps and respects the forbidden directions."""
         rows = np.concatenate([around.normal, -self.one_sided])
         approach = np.sum(around.normal * around.velocity, axis=1) - around.drift - self.gamma * around.gap
         return nearest_velocity(desired, rows, np.concatenate([approach, -limits]))

@@ -31,7 +31,7 @@ _BESIDE = 2e-3  # [m] from the learned path: less is not called avoiding
 
 
 class ToolGaps:
-    """Distances between the tool, as one sphere about its tip, and all obstacles of a scene.
+    """Distances from all obstacles of a scene to the tool, which one sphere about its tip represents.
 
     The gap to obstacle ``o`` at the tip position ``x`` is ``g_o(x) = sd_o(x) - r``, with the signed distance ``sd_o``
     and the radius ``r`` of the sphere that contains the tool. The gap is negative in contact. Its gradient is the
@@ -58,8 +58,9 @@ class ToolGaps:
         """Return the gap of every tip position to every obstacle, shape (n_obstacles, ...) [m].
 
         Args:
-            points: positions of the tip, shape (..., 3) [m]; with ``times``, shape (k, ..., 3).
-            times: times since the motion began, shape (k,) [s]; None: all points at time 0.
+            points: positions of the tip, shape (..., 3) [m]; if ``times`` is given, shape (k, ..., 3).
+            times: time since the motion began for each of the k groups of points, shape (k,) [s]; None: time 0 for all
+                points.
         """
         return distances(self._packed, points, times) - self.radius
 
@@ -70,21 +71,21 @@ class ToolGaps:
 
 
 class BaselinePolicy(PathPolicy):
-    """Base class of the baselines that plan the path of the tool, from the same learned path and the same gaps.
+    """Base class of the baselines that plan the path of the tool; all of them use the same learned path and gaps.
 
-    A subclass implements :meth:`tool_path`. The orientation of the tool is the learned one at equal phases.
+    A subclass implements :meth:`tool_path`. At each phase, the tool has the learned orientation.
 
     If the subclass also implements :meth:`reaction`, the method reacts to obstacles that move, appear or disappear.
-    From then on, its equations are integrated one control period at a time, with the obstacles as they are observed,
-    and nothing is refused. In a scene that stands still, the path is planned once.
+    As soon as the scene changes, the method integrates its equations one control period at a time, with the observed
+    obstacles. It then refuses no scene. While the scene stands still, the method plans its path only once.
 
     Args:
         skill: skill to reproduce.
         options: arguments of :class:`~imitarm.policies.path_policy.PathPolicy`.
 
     Attributes:
-        predicts: whether the planned path avoids moving obstacles where they will be at the planned times. Such a plan
-            is followed on schedule.
+        predicts: whether the planned path avoids moving obstacles at the places where they will be at the planned
+            times. The policy follows such a plan on schedule.
     """
 
     predicts: ClassVar[bool] = False
@@ -97,7 +98,7 @@ class BaselinePolicy(PathPolicy):
         self._reaction: Reaction | None = None
 
     def reaction(self, nominal: Trajectory, position: Array, velocity: Array, fraction: float) -> Reaction | None:
-        """Return the motion for a scene that changes; None if the method only plans.
+        """Return the motion for a scene that changes; None if the method can only plan a whole path.
 
         Args:
             nominal: the learned path between the start and the goal of this motion, 200 samples.
@@ -140,10 +141,10 @@ class BaselinePolicy(PathPolicy):
         return replace(plan, only_on_schedule=self.predicts and not scene.packed.still)
 
     def reset(self, observation: Observation) -> None:
-        """Plan the path if the scene stands still; else begin to react.
+        """Plan the path if the scene stands still; otherwise, begin to react step by step.
 
         Raises:
-            InfeasibleError: when the method plans, and knows that it has no solution; the message says why.
+            InfeasibleError: when the method plans a path and finds no solution; the message gives the reason.
         """
         scene = observation.scene.now(observation.time)
         self._observed, self._reaction, self._last = scene.packed, None, np.zeros(3)

@@ -29,20 +29,20 @@ _NEAR, _STILL = 5e-3, 5e-4  # [m] from the goal, and within a quarter of the dur
 
 
 class MotionState(NamedTuple):
-    """State of the motion, and the obstacles as seen from the tool.
+    """State of the motion, and distances and directions from the tool to the obstacles.
 
-    Velocities are multiplied by the duration T, as in the equation of a primitive (``tau x' = v`` with tau = T).
+    Velocities are multiplied by the duration T, as in the equation of a motion primitive (``tau x' = v`` with tau = T).
 
     Attributes:
         position: x, shape (3,) [m].
         velocity: v = T x', shape (3,) [m].
-        phase: s, from 1 at the start to 0.01 after the duration.
+        phase: s, which decays from 1 at the start to 0.01 after the duration T.
         fraction: time divided by the duration.
         learned: position of the nominal path at this time, shape (3,) [m].
         distance: distance from the tool to each obstacle, minus the required clearance; at least 5 mm, shape (n,) [m].
         reach: distance from the tool's tip to the closest point of each obstacle; at least 5 mm, shape (n,) [m].
         normal: outward normals at the closest points, shape (n, 3); the closest point is ``x - reach normal``.
-        relative: v minus the velocity of the closest point times T, shape (n, 3) [m].
+        relative: v minus T times the velocity of each obstacle's closest point, shape (n, 3) [m].
         gap: distance from the tool to each obstacle, minus the required clearance; may be negative, shape (n,) [m].
     """
 
@@ -70,14 +70,14 @@ class CoupledMotion(BaselinePolicy):
 
         T^2 x'' = K (y(s) - x) - D T x' + Phi,        |Phi| <= T^2 a_max
 
-    The spring follows the target ``y(s)`` of the skill's primitive, with the skill's own gains K and D. T is the
-    duration. The spring is integrated exactly in steps of 10 ms, during which ``Phi`` is constant. The motion ends at
-    the goal, but not before the learned duration. A method whose tool is not within 5 mm of the goal after twice the
-    duration refuses.
+    The primitive is a spring that follows the target ``y(s)`` of the skill, with the skill's own gains K and D. T is
+    the duration [s]. The equation is integrated exactly in steps of 10 ms, during which ``Phi`` is constant. The motion
+    ends at the goal, but not before the learned duration. If the tool is not within 5 mm of the goal after twice the
+    duration, the method refuses the scene.
 
-    A subclass implements :meth:`term`. A part of ``Phi`` in a forbidden direction is removed. The limit ``a_max`` is
-    not part of any of the methods. It prevents a term that grows without bound near an obstacle from throwing the tool
-    away within one step.
+    A subclass implements :meth:`term`. The component of ``Phi`` in a forbidden direction is removed. The published
+    methods have no limit ``a_max``. The limit is needed because some terms grow without bound near an obstacle, and
+    would throw the tool far away within one step.
 
     Args:
         skill: skill to reproduce.
@@ -97,7 +97,7 @@ class CoupledMotion(BaselinePolicy):
         """Return the coupling term Phi at a state, the sum over all obstacles, shape (3,) [m]."""
 
     def bounded_term(self, state: MotionState, limit: float) -> Array:
-        """Return the coupling term without its forbidden part and within ``limit`` [m], shape (3,) [m]."""
+        """Return the coupling term, at most ``limit`` [m], without its forbidden components, shape (3,) [m]."""
         phi = self.allowed(self.term(state))
         size = float(np.sqrt(phi.dot(phi)))
         return phi * (limit / size) if size > limit else phi
@@ -107,7 +107,7 @@ class CoupledMotion(BaselinePolicy):
 
         Args:
             before: [x; T x'] before the step, shape (2, 3) [m].
-            after: the same after the step, from the equation.
+            after: [x; T x'] after the step, as the equation gives it, shape (2, 3) [m].
             state: state before the step, with the obstacles.
             step: length of the step, as a fraction of the duration.
         """
@@ -220,7 +220,7 @@ class _CoupledReaction(Reaction):
 
 
 class Surroundings:
-    """The obstacles of one scene, as seen from the tool during a motion.
+    """Computes distances and directions from the tool to the obstacles of one scene during a motion.
 
     Args:
         gaps: distances to the obstacles.
@@ -234,13 +234,14 @@ class Surroundings:
         self._clearance, self._duration = clearance, duration
 
     def state(self, z: Array, fraction: float, learned: Array, time: float | None = None) -> MotionState:
-        """Return the state for position and velocity ``z`` = [x; T x'] (2, 3) at a fraction of the duration.
+        """Return the state of the motion for a position and a velocity.
 
         Args:
-            z: position and velocity.
+            z: [x; T x'], the position and the velocity times the duration T, shape (2, 3) [m].
             fraction: time divided by the duration.
             learned: position of the nominal path at this time, shape (3,) [m].
-            time: time since the obstacles were where they are in the scene [s]; None: since the motion began.
+            time: time for which the obstacles have moved from their poses in the scene [s]; None: the time since the
+                motion began.
         """
         x, v = z
         time = fraction * self._duration if time is None else time

@@ -34,11 +34,11 @@ _REMEDY = "train the network again with python -m imitarm.benchmark.train_ann"
 
 
 class Inputs(NamedTuple):
-    """The inputs of the network for each obstacle, and the linear map from its outputs to the coupling term.
+    """The inputs of the network for each obstacle, and the linear map from the network's outputs to the coupling term.
 
     Attributes:
-        features: shape (n, 10).
-        maps: shape (n, 3, 3); the coupling term is ``sum_i maps_i outputs_i`` [m].
+        features: inputs of the network for each obstacle, shape (n, 10).
+        maps: linear map for each obstacle, shape (n, 3, 3); the coupling term is ``sum_i maps_i outputs_i`` [m].
     """
 
     features: Array
@@ -48,13 +48,15 @@ class Inputs(NamedTuple):
 def inputs_of(state: MotionState, stiffness: float) -> Inputs:
     r"""Return the inputs of the network at a state.
 
-    The frame ``Q = [v_r / |v_r|, p, b]`` of an obstacle has the relative velocity as its first axis, the perpendicular
-    ``p`` towards the obstacle as its second, and the binormal as its third. In this frame, the features do not change
-    when the scene is rotated. With the vector ``r`` from the tool to the closest point, the features are::
+    Each obstacle has a frame ``Q = [v_r / |v_r|, p, b]``. The first axis is the direction of the relative velocity
+    ``v_r``. The second axis ``p`` is perpendicular to the first and points towards the obstacle. The third axis ``b``
+    is perpendicular to both. In this frame, the features do not change when the scene is rotated. Let ``r`` be the
+    vector from the tool to the closest point, ``d`` the gap, ``theta`` the angle between ``v_r`` and ``r``, and ``s``
+    the phase. The features are::
 
         d / 0.1 m, |v_r|, cos(theta), sin(theta), Q^T r / 0.1 m (3), s, |x - x_0| / 0.05 m, 1
 
-    The linear map is ``K s exp(-d / 0.1 m) Q``. Where the tool does not move relative to the obstacle, it is 0.
+    The linear map is ``K s exp(-d / 0.1 m) Q``, or 0 if the tool does not move relative to the obstacle.
 
     Args:
         state: state of the motion.
@@ -89,32 +91,34 @@ def inputs_of(state: MotionState, stiffness: float) -> Inputs:
 class DMPANN(CoupledMotion):
     r"""DMP+ANN: a primitive with a learned coupling term (after Rai et al. 2017).
 
-    The term is the sum over all obstacles of the outputs of one small network, in a frame that moves with the tool::
+    For each obstacle, one small network NN computes a vector in a frame that moves with the tool. The coupling term is
+    the weighted sum of these vectors::
 
         Phi = gain K s sum exp(-d / 0.1 m) Q NN(features)
 
-    The features and the frame Q are those of :func:`inputs_of`; the network has two layers of 32 units with tanh. The
-    factor ``s``, the phase of the primitive, decays to 0, so the motion always ends at the goal.
+    :func:`inputs_of` explains the features and the frame Q. The network has two layers of 32 units with tanh. The
+    factor ``s`` is the phase of the primitive; it decays to 0, so the motion always ends at the goal.
 
     **Training.** The expert is the optimiser of :mod:`~imitarm.policies.baselines.expert`, which is independent of the
-    compared methods. Its path for one scene is the nominal path plus a deviation ``e(t)``, and the term that produces
-    this path is ``C = K e + D T e' + T^2 e''``. The network is trained on C along the expert's paths around one
-    obstacle, and then three times on the states that its own motions visit (DAgger, Ross et al. 2011).
-    A network that is trained on the squared error returns means, which are too small. The factor ``gain`` corrects
-    this; it is chosen in scenes for validation. ``python -m imitarm.benchmark.train_ann`` trains the network; the
-    package contains its weights.
+    compared methods. The expert's path in a scene is the nominal path plus a deviation ``e(t)``; the coupling term ``C
+    = K e + D T e' + T^2 e''`` produces this path. The network first learns C along the expert's paths around one
+    obstacle. Then, in three rounds, it also learns C in the states that its own motions visit (DAgger, Ross et al.
+    2011). A network that is trained on the squared error returns means, and these are too small to keep the clearance.
+    The factor ``gain`` corrects this; its value is chosen in validation scenes. ``python -m
+    imitarm.benchmark.train_ann`` trains the network; the package contains its weights.
 
-    **Changes.** The paper learns from demonstrations by persons. It postprocesses the output so that it vanishes when
-    the tool has passed the obstacle or is at the goal; here, the factors ``s`` and ``exp(-d / 0.1 m)`` do this.
+    **Changes.** The paper learns from demonstrations by persons. In the paper, a further step reduces the output to
+    zero when the tool has passed the obstacle or is at the goal. Here, the factors ``s`` and ``exp(-d / 0.1 m)`` have
+    this effect.
 
-    **Known failure.** The expert passes an obstacle on one of two sides, and its choice can't be seen from a state in
-    which the tool moves straight at the obstacle. Near such states, the network returns a mean of both. Several
-    obstacles are never seen in training; their terms are added.
+    **Known failure.** The expert passes an obstacle on one of two sides. If the tool moves straight at the obstacle,
+    its state does not tell which side the expert chooses. Near such states, the network returns a mean of both sides.
+    The training scenes have only one obstacle; for several obstacles, the terms are added.
 
     Args:
         skill: skill to reproduce.
-        gain: factor of the term; None: the one that was chosen with the weights of the package; 1 for another network.
-        network: weights; None: those of the package.
+        gain: factor of the term; None: the gain that was chosen for the package's weights, or 1 for another network.
+        network: trained network; None: the network of the package.
         options: arguments of :class:`~imitarm.policies.baselines.coupled_motion.CoupledMotion`.
     """
 
@@ -177,7 +181,7 @@ def load_weights(path: str | os.PathLike[str]) -> Weights:
 
     Raises:
         InputError: when the file can't be read.
-        FileFormatError: when the content is not that of a network with 10 inputs and 3 outputs.
+        FileFormatError: when the file does not contain a network with 10 inputs and 3 outputs.
     """
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))

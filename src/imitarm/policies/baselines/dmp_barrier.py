@@ -1,4 +1,4 @@
-"""DMP with a barrier: the motion of a primitive, filtered so that the clearance is kept."""
+"""DMP with a barrier: a dynamic movement primitive whose velocity is filtered so that the clearance is kept."""
 
 from __future__ import annotations
 
@@ -23,16 +23,17 @@ class DMPBarrier(CoupledMotion):
 
     .. math:: \min |v - u|^2 \quad \text{s.t.} \quad n_o \cdot (v - v_o) \ge -\gamma h_o
 
-    with the gap :math:`h_o` beyond the required clearance, the outward normal :math:`n_o` and the velocity :math:`v_o`
-    of each obstacle's closest point. The spring continues from where the tool is, so that it pulls harder the farther
-    the tool falls behind. The combination is that of dynamic movement primitives with control barrier functions (Ames
-    et al. 2019 for the barrier).
+    Here, :math:`h_o` is the distance to obstacle o minus the required clearance, :math:`n_o` is the outward normal, and
+    :math:`v_o` is the velocity of the obstacle's closest point. The spring starts each step at the actual position of
+    the tool. The farther the tool falls behind, the harder the spring pulls. The method combines a dynamic movement
+    primitive with a control barrier function (Ames et al. 2019).
 
-    **Known failure.** As for every barrier, the tool stops in front of an obstacle that it approaches head on.
+    **Known failure.** The tool stops in front of an obstacle that it approaches head on, as with every barrier
+    function.
 
     Args:
         skill: skill to reproduce.
-        gamma: how fast the tool may use up the gap [1/s].
+        gamma: largest rate at which the gap may shrink, divided by the gap [1/s].
         options: arguments of :class:`~imitarm.policies.baselines.coupled_motion.CoupledMotion`.
     """
 
@@ -43,11 +44,11 @@ class DMPBarrier(CoupledMotion):
         self.gamma = finite_number(gamma, "DMPBarrier: gamma", "1/s", above=0.0)
 
     def term(self, state: MotionState) -> Array:
-        """Return no force: the barrier acts on the velocity."""
+        """Return a zero coupling term, because the barrier acts on the velocity."""
         return np.zeros(3)
 
     def constrained(self, before: Array, after: Array, state: MotionState, step: float) -> Array:
-        """Return the state after a step whose velocity keeps all gaps; velocities are per duration, as in z."""
+        """Return [x; T x'] after a step whose velocity keeps all gaps."""
         proposed = (after[0] - before[0]) / step
         rows = np.concatenate([state.normal, -self._forbidden])
         duration = self.skill.duration_

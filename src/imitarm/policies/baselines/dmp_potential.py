@@ -19,10 +19,10 @@ def dynamic_potential(velocity: Array, normal: Array, distance: Array, gain: flo
     """Return ``U = lambda (-cos theta)^beta |v| / p`` if ``cos theta < 0``, else 0, shape (n,).
 
     Args:
-        velocity: v, relative to each obstacle, shape (n, 3).
-        normal: direction from the closest point of each obstacle to the tool, shape (n, 3); theta is the angle between
-            the two.
-        distance: p, above 0, shape (n,) [m].
+        velocity: v, velocity of the tool relative to each obstacle, times the duration, shape (n, 3) [m].
+        normal: n, unit vector from the closest point of each obstacle to the tool, shape (n, 3); theta is the angle
+            between v and n.
+        distance: p, distance of the tool to each obstacle, above 0, shape (n,) [m].
         gain: lambda.
         exponent: beta.
     """
@@ -34,14 +34,15 @@ def dynamic_potential(velocity: Array, normal: Array, distance: Array, gain: flo
 def dynamic_force(velocity: Array, normal: Array, distance: Array, reach: Array, gain: float, exponent: float) -> Array:
     r"""Return minus the gradient of :func:`dynamic_potential` with respect to the tool's position, shape (n, 3).
 
-    The closest point of the obstacle is at the distance ``reach`` in the direction ``-n``; it is held fixed::
+    The closest point of the obstacle is at the distance ``reach`` in the direction ``-n``. The gradient treats this
+    point as fixed::
 
         -grad U = lambda (-cos)^(beta - 1) |v| / p (beta grad(cos) - cos / p n),   grad(cos) = (v / |v| - cos n) / reach
 
     Args:
         velocity: v, shape (n, 3).
         normal: n, shape (n, 3).
-        distance: p, above 0, shape (n,) [m].
+        distance: p, distance of the tool to each obstacle, above 0, shape (n,) [m].
         reach: distance from the tool's tip to the closest point, above 0, shape (n,) [m].
         gain: lambda.
         exponent: beta.
@@ -59,20 +60,20 @@ class DMPPotential(CoupledMotion):
     r"""DMP with a dynamic potential field, the avoidance term of Park et al. (2008).
 
     The potential depends on the direction and the speed of the motion: it is 0 while the tool moves away from the
-    obstacle, and it grows with the speed of the approach and with nearness::
+        obstacle. It increases with the speed of approach, and as the distance decreases::
 
         U = lambda (-cos theta)^beta |v_r| / p    if cos theta < 0, else 0;      Phi = -sum grad U
 
-    Here, ``v_r = v - v_o`` is the velocity relative to the obstacle, ``theta`` the angle between ``v_r`` and the
-    direction from the closest point of the obstacle to the tool, and ``p`` the distance of the tool, minus the
-    required clearance.
+    Here, ``v_r = v - v_o`` is the velocity of the tool relative to the obstacle. ``theta`` is the angle between ``v_r``
+    and the direction from the closest point of the obstacle to the tool. ``p`` is the distance between tool and
+    obstacle, minus the required clearance.
 
-    **Changes.** The published field surrounds points of the obstacle. Here, it surrounds the closest point, which is
-    held fixed in the gradient. The published relative velocity does not include a motion of the obstacle. Distances
-    below 5 mm count as 5 mm.
+    **Changes.** The published field surrounds points of the obstacle. Here, the field surrounds only the closest point,
+    which the gradient treats as fixed. The published velocity is the tool's own velocity, not the velocity relative to
+    the obstacle. Here, distances below 5 mm count as 5 mm.
 
-    **Known failure.** A motion straight at an obstacle is only slowed down, because its gradient is parallel to the
-    motion. The tool then arrives late, or stays in front of the obstacle.
+    **Known failure.** If the tool moves straight at an obstacle, the gradient is parallel to the motion. The field then
+    only slows the tool down and does not deflect it. The tool arrives late, or stays in front of the obstacle.
 
     Args:
         skill: skill to reproduce.

@@ -35,14 +35,14 @@ class DMPSteering(CoupledMotion):
 
     Let ``v_r = v - v_o`` be the velocity relative to the obstacle, ``n`` the outward normal at the closest point, and
     ``theta`` the angle between ``v_r`` and the direction ``-n`` to that point. The term rotates the velocity away from
-    the obstacle, in the plane of the two directions, and it acts only while the tool approaches::
+    the obstacle, in the plane of ``v_r`` and ``n``. It acts only while the tool approaches the obstacle::
 
         Phi = sum gamma theta exp(-beta theta) |v_r| u exp(-kappa d)      if theta < 90 degrees
         u = (n + cos(theta) v_r / |v_r|) / sin(theta)                     unit vector perpendicular to v_r
 
-    **Changes.** The published term uses the centre of a point obstacle and has no factor ``exp(-kappa d)``, so that an
-    obstacle 50 m away bends the path as much as a near one. Here, the obstacle is represented by its closest point, and
-    ``d`` is the distance of the tool, minus the required clearance.
+    **Changes.** The published term uses the centre of a point obstacle and has no factor ``exp(-kappa d)``, so an
+    obstacle 50 m away bends the path as much as a near obstacle. Here, the closest point represents the obstacle, and
+    ``d`` is the distance from the tool to the obstacle, minus the required clearance.
 
     **Known failure.** The term is 0 for ``theta = 0``: the tool goes straight into an obstacle that it approaches head
     on. The term also guarantees no clearance, because its rate of rotation is bounded, however near the obstacle is.

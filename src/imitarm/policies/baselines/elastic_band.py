@@ -25,18 +25,20 @@ _SETTLED = 1e-6  # [m] the band is at rest when no node moves farther in one ste
 class ElasticBand(BaselinePolicy):
     r"""Displace the learned path like an elastic band (Quinlan and Khatib 1993).
 
-    The nodes ``x_i = x0_i + d_i`` of the band feel a tension towards the neighbours and a repulsion from obstacles that
-    are nearer than the influence distance ``d_0`` beyond the clearance::
+    The band has nodes ``x_i = x0_i + d_i``, which are the learned positions ``x0_i`` plus displacements ``d_i``. A
+    tension pulls each node towards its neighbours. An obstacle o repels a node along its normal ``n_o`` if their gap
+    beyond the clearance is smaller than the influence distance ``d_0``::
 
         F_i = (d_(i-1) - 2 d_i + d_(i+1)) + k sum_o max(d_0 - gap_o(x_i), 0) n_o
 
-    The start and the goal are fixed. The equilibrium is the minimum of the energy ``1/2 sum |d_(i+1) - d_i|^2 + k/2 sum
-    max(d_0 - gap, 0)^2``, which is found by Newton steps that take the normals as constant. Like the published band,
-    it starts from a path that is free: the learned path, lifted off the obstacles to the side with the least jerk.
+    The start and the goal are fixed. The equilibrium minimises an energy:
+    ``1/2 sum |d_(i+1) - d_i|^2 + k/2 sum max(d_0 - gap, 0)^2``.
+    Newton steps, which treat the normals as constant, find this minimum. Like the published band, the band starts from
+    a free path. This is the learned path, displaced around each obstacle to the side that needs the least jerk.
 
     Args:
         skill: skill to reproduce.
-        repulsion: k, relative to the tension.
+        repulsion: k, stiffness of the repulsion divided by the stiffness of the tension.
         influence: d_0 [m].
         options: arguments of :class:`~imitarm.policies.baselines.baseline_policy.BaselinePolicy`.
     """

@@ -1,7 +1,8 @@
-r"""The expert: paths around obstacles of least jerk, found by sequential quadratic programming.
+r"""The expert: paths of least jerk around obstacles, found by sequential quadratic programming.
 
-The paths are data for the baselines that learn (``gmm-irl``, ``dmp-ann``), and an upper bound in benchmarks. The
-optimiser knows nothing of the compared methods: it uses no Gaussian components, no primitive and no potential.
+The baselines that learn (``gmm-irl``, ``dmp-ann``) are trained with these paths. In benchmarks, the paths show how well
+an independent optimiser does. It uses no part of the compared methods: no Gaussian components, no motion primitive and
+no potential.
 
 Let ``x_i`` be the nominal path and ``x_i + d_i`` the path to find, with ``i = 0..99``. The deviation minimises the
 integral of its squared jerk, written with third differences, under exact constraints on the gap ``g_o`` to every
@@ -11,11 +12,11 @@ obstacle ``o``::
     s.t. g_o(x_i + d_i) >= clearance,   f . d_i <= 0 for every forbidden direction f,
          d_0 = d_1 = d_2 = 0 = d_97 = d_98 = d_99
 
-so the path leaves the start and reaches the goal with the nominal velocity and acceleration. All obstacles are convex,
-hence the gap is a convex function of the position, and the tangent ``g_o(y_i) + n_o . (x_i + d_i - y_i)`` at an earlier
-path ``y`` is never larger than the gap. A solution of the quadratic program with the tangents therefore keeps the exact
-constraints. Tangents at this solution give the next quadratic program, whose cost is at most as large. The iteration
-ends at a point that meets the first-order optimality conditions.
+The zero deviations at both ends keep the nominal velocity and acceleration at the start and at the goal. All obstacles
+are convex, so the gap is a convex function of the position. Its tangent ``g_o(y_i) + n_o . (x_i + d_i - y_i)`` at any
+path ``y`` is therefore never larger than the gap. The quadratic program has these tangents as constraints, so its
+solution also keeps the exact constraints. The tangents at the solution give the next quadratic program, whose cost is
+at most as large. The iteration ends at a point that meets the first-order optimality conditions.
 """
 
 from __future__ import annotations
@@ -52,22 +53,22 @@ _SOLVED = 1  # daqp's exit flag of an optimal solution
 
 
 def expert_paths(nominal: Trajectory, gaps: ToolGaps, *, clearance: float, forbidden: ArrayLike = ()) -> list[Array]:
-    """Return the locally optimal paths around the obstacles, on all sides that were found, best first.
+    """Return all locally optimal paths around the obstacles that were found; the path of least jerk comes first.
 
-    The optimiser starts from several first displacements: for each stretch of the nominal path that is too close to an
-    obstacle, in 8 directions around the path. The result is deterministic.
+    The optimiser starts from several displaced paths. Each stretch of the nominal path that is too close to an obstacle
+    is displaced in 8 directions around the path. The result is deterministic.
 
     Args:
         nominal: the path without obstacles.
-        gaps: distances to the obstacles; moving obstacles are taken at the time of each sample.
-        clearance: smallest gap of the samples [m]. Between samples the gap of the polyline can be smaller by the sag,
-            at most ``h^2 / (8 (clearance + radius of the tool))`` with the distance ``h`` of the samples.
+        gaps: distances to the obstacles; a moving obstacle is placed where it is at the time of each sample.
+        clearance: smallest gap of the samples [m]. Between two samples at a distance ``h``, the gap of the polyline can
+            be smaller by up to ``h^2 / (8 (clearance + radius of the tool))``.
         forbidden: directions in which the path must not leave the nominal path, shape (m, 3).
 
     Returns:
         Positions at 100 equally spaced times, each of shape (100, 3) [m]; empty if no path was found, for example
-        because the start is too close to an obstacle. Paths that leave the nominal path by more than 0.5 m are left
-        out: close to the start, least jerk can lead to such paths.
+        because the start is too close to an obstacle. Paths that deviate from the nominal path by more than 0.5 m are
+        left out. Such paths can have the least jerk if an obstacle is close to the start.
     """
     clearance = finite_number(clearance, "expert_paths: clearance", "m", at_least=0.0)
     directions = finite_array(np.reshape(np.asarray(forbidden, dtype=float), (-1, 3)), (None, 3), "forbidden")
@@ -98,8 +99,8 @@ class PathProblem(NamedTuple):
         times: times of the samples since the motion began, shape (100,) [s].
         gaps: distances to the obstacles.
         clearance: required gap [m].
-        axes: orthonormal basis of the directions that are not forbidden both ways, as columns, shape (3, d).
-        one_sided: the other forbidden directions in this basis, shape (m, d).
+        axes: orthonormal basis of the d directions that are permitted at least one way, as columns, shape (3, d).
+        one_sided: directions that are forbidden only one way, in the basis ``axes``, shape (m, d).
     """
 
     nominal: Array
@@ -126,7 +127,7 @@ class PathProblem(NamedTuple):
         return jerk_cost(path - self.nominal, float(self.times[1]))
 
     def keeps_clearance(self, path: Array) -> bool:
-        """Whether the samples keep the clearance and do not stray, and the segments between them jump over nothing."""
+        """Whether the samples keep the clearance and the limit of deviation, and no segment jumps over an obstacle."""
         strays = np.linalg.norm(path - self.nominal, axis=1).max() > _FARTHEST
         if strays or self.gaps_at(path)[0].min() < self.clearance - _KEPT:
             return False
@@ -168,8 +169,9 @@ def _least_jerk(samples: NDArray[np.intp], directions: Array, lower: Array) -> A
 def displaced_paths(problem: PathProblem) -> list[Array]:
     """Return paths (100, 3) on all sides of the obstacles, from which an optimiser can start.
 
-    Each stretch of the nominal path that is too close to an obstacle is lifted off in a direction around the path, by
-    the deviation of least jerk. With several stretches, only the directions of least jerk are combined.
+    Each stretch of the nominal path that is too close to an obstacle is displaced in several directions around the
+    path, by the deviation of least jerk. If there are several stretches, only the best direction of each stretch is
+    combined with the others.
     """
     too_close = problem.gaps_at(problem.nominal)[0].min(axis=0, initial=np.inf) < problem.clearance
     edges = np.flatnonzero(np.diff(np.concatenate([[False], too_close, [False]]).astype(int)))

@@ -42,8 +42,8 @@ def reconstructed_demonstrations(skill: Skill, n_samples: int = _SAMPLES) -> lis
 def attractor_of(path: Trajectory, skill: Skill) -> Trajectory:
     """Return the attractor ``y = x + (D/K) T x' + (T^2/K) x''`` of a path, for the gains of a skill.
 
-    A spring that follows this attractor moves along the path. The attractor is the target of a primitive that is fitted
-    to the path, so that the samples need not be differentiated twice.
+    A spring that follows this attractor moves along the path. The function fits a motion primitive to the path and
+    returns the primitive's target, so the samples need not be differentiated twice.
     """
     primitive = DMP(skill.dmp_.gains_, n_basis=skill.dmp_.n_basis).fit(path, exact_ends=True)
     phases = np.exp(-DECAY * (path.times - path.times[0]) / path.duration)
@@ -53,29 +53,30 @@ def attractor_of(path: Trajectory, skill: Skill) -> Trajectory:
 class GMMDMP(CoupledMotion):
     r"""GMM+DMP: a spring that follows a mixture of attractors (Calinon et al. 2012).
 
-    The attractor of every demonstration is ``y = x + (D/K) T x' + (T^2/K) x''``. A Gaussian mixture over time and
-    attractor, and its regression, give the mean attractor ``y(t)`` and its covariance. The motion is::
+    The attractor of every demonstration is ``y = x + (D/K) T x' + (T^2/K) x''``. A Gaussian mixture is fitted to time
+    and attractor. Its regression gives the mean attractor ``y(t)`` and the covariance. The motion is::
 
         T^2 x'' = K (y(t) - x) - D T x' + Phi,        Phi = sum k (1/d - 1/d_0) d^-2 n     (thesis Eq 2.19)
 
-    The published method does not avoid obstacles. ``Phi`` is the repulsion of
-    :mod:`~imitarm.policies.baselines.potential_field`; ``force=0`` is the method without it.
+    The published method does not avoid obstacles. Here, ``Phi`` is the repulsion of
+    :mod:`~imitarm.policies.baselines.potential_field`; with ``force=0``, the method is the published one.
 
     **Changes.** A skill does not keep its demonstrations; :func:`reconstructed_demonstrations` replaces them. The
-    mixture is over the time instead of the phase ``s = exp(-alpha t / T)``, which is the same variable on another
-    scale. Over the phase, one Gaussian covers the whole second half of the motion, and the motion ends beside the goal.
+    mixture is over the time t instead of the phase ``s = exp(-alpha t / T)``. The phase decays exponentially, so one
+    Gaussian over the phase would cover the whole second half of the motion, and the motion would end beside the goal.
 
-    **Known failure.** The repulsion depends on the position alone. In front of a wide obstacle it cancels the spring
-    until the attractor has passed the obstacle, and the tool is then pulled through the obstacle, or arrives late.
+    **Known failure.** The repulsion depends on the position alone. In front of a wide obstacle, the repulsion balances
+    the spring until the attractor has passed the obstacle. The spring then pulls the tool through the obstacle, or the
+    tool arrives late.
 
     Args:
         skill: skill to reproduce.
         force: k [m^4].
         influence: d_0 [m].
-        variable_stiffness: whether K is multiplied by ``clip(mean variance / variance(t), 0.3, 3)`` with the variance
-            of the attractor, so that the spring is stiff where the demonstrations agree. The undisturbed motion does
-            not change.
-        n_components: number of Gaussians; None: twice the number of the skill, because an attractor bends more than its
+        variable_stiffness: whether K is multiplied by ``clip(mean variance / variance(t), 0.3, 3)``, where the variance
+            is that of the attractor. The spring is then stiff where the demonstrations agree. A motion without
+            obstacles does not change.
+        n_components: number of Gaussians; None: twice the skill's number, because an attractor bends more than its
             path.
         options: arguments of :class:`~imitarm.policies.baselines.coupled_motion.CoupledMotion`.
     """
@@ -106,7 +107,7 @@ class GMMDMP(CoupledMotion):
         self._ratios = np.clip(variance.mean() / variance, *_STIFFNESS_RANGE)
 
     def target(self, nominal: Trajectory, fractions: Array) -> Array:
-        """Return the mean attractor; another start or goal changes it as it changes the target of the primitive."""
+        """Return the mean attractor; a new start or goal moves it as it moves the target of the skill's primitive."""
         primitive, phases = self.skill.dmp_, np.exp(-DECAY * fractions)
         moved = primitive.begin(nominal.positions[0], nominal.positions[-1]).target.at(phases)
         learned = primitive.begin().target.at(phases)

@@ -28,7 +28,7 @@ from imitarm.validation import finite_array, finite_number
 Array = NDArray[np.float64]
 
 HORIZON = 20
-"""Points of the horizon."""
+"""Number of points of the receding horizon."""
 _SPACING = 2  # of the horizon's points, in samples of the whole path, which has 100
 _N_FREE = N_FREE / _SPACING  # points to which the mean features refer
 PERIOD = 1.0 / 30.0
@@ -48,22 +48,23 @@ def learned_weights() -> dict[str, float]:
 
 
 class GmmIrl(BaselinePolicy):
-    r"""Follow the path of least cost, with a cost whose weights were learned from demonstrated detours.
+    r"""Follow the path of least cost; the weights of the cost were learned from demonstrated detours.
 
-    The cost ``J = sum_k w_k phi_k`` has features about the deviation from the learned path, the jerk of the deviation,
-    and the obstacles (:mod:`imitarm.policies.baselines.path_cost`). The weights were learned by maximum-entropy inverse
-    reinforcement learning from the optimal paths of an independent expert in other scenes
-    (:mod:`imitarm.benchmark.train_irl`). L-BFGS finds a local minimum from the learned path, and from paths
-    that are displaced to each side; the policy follows the minimum of least cost.
+    The cost ``J = sum_k w_k phi_k`` has features ``phi_k`` with weights ``w_k``. The features measure the deviation
+    from the learned path, the jerk of the deviation, and the nearness to obstacles
+    (:mod:`imitarm.policies.baselines.path_cost`). The weights were learned by maximum-entropy inverse reinforcement
+    learning from the optimal paths of an independent expert in other scenes (:mod:`imitarm.benchmark.train_irl`).
+    The optimiser L-BFGS starts from the learned path and from paths that are displaced to each side. Each start leads
+    to a local minimum; the policy follows the minimum of least cost.
 
     Among obstacles that move, the cost is minimised again 30 times a second over the next 20 points
     (:class:`HorizonReaction`).
 
-    The distance to obstacles is a cost, not a constraint, so the path can be closer than the required clearance.
+    The distance to obstacles enters as a cost, not as a constraint, so the path may not keep the required clearance.
 
     Args:
         skill: skill to reproduce.
-        weights: weight of each feature in ``path_cost.FEATURES``; None: the learned ones.
+        weights: weight of each feature in ``path_cost.FEATURES``; None: the learned weights.
         closeness: factor of the weight of the deviation.
         avoidance: factor of the weights of the obstacles.
         margin: distance that is subtracted from each gap [m].
@@ -125,7 +126,7 @@ class Weighted(NamedTuple):
         weights: weight of each feature.
         margin: distance that is subtracted from each gap [m].
         axes: orthonormal basis of the allowed directions, as columns, shape (3, k).
-        one_sided: directions in which the path must not be displaced, in this basis, shape (m, k).
+        one_sided: directions in which the path must not be displaced, in the basis ``axes``, shape (m, k).
         tool_spheres: spheres that contain the tool, or None.
     """
 
@@ -208,10 +209,10 @@ class _Horizon:
 
 
 class HorizonReaction(Reaction):
-    """Follow the path of least cost over the next 20 points, 0.4 of the duration, planned 30 times a second.
+    """Plan the path of least cost over the next 20 points, which last 0.4 of the duration, 30 times a second.
 
-    The obstacles are predicted with their velocities. L-BFGS starts from the last plan, from the learned path, and from
-    displacements to the sides.
+    The obstacles are predicted with constant velocities. L-BFGS starts from the last plan, from the learned path, and
+    from paths that are displaced to the sides.
     """
 
     def __init__(self, cost: Weighted, nominal: Trajectory, position: Array, velocity: Array, fraction: float) -> None:
@@ -224,7 +225,7 @@ class HorizonReaction(Reaction):
             self._plan[1] = self._spacing * (velocity - learned) @ cost.axes
 
     def step(self, scene: Scene, dt: float) -> None:
-        """Plan if the plan is old, and follow the plan."""
+        """Plan again if the last plan is old, then follow the plan for one step."""
         if self._age >= PERIOD - 1e-9:
             self._plan, self._age = self._planned(scene), 0.0
         self._age += dt

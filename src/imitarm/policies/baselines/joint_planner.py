@@ -1,19 +1,20 @@
 r"""RRT-Connect in joint space: find any joint path to the goal on which the whole arm is clear.
 
-Two trees of joint postures grow towards random postures and towards each other, one from the start and one from the
-postures at the goal (Kuffner and LaValle, "RRT-Connect: an efficient approach to single-query path planning", ICRA
-2000). An edge is a straight line between two postures, :math:`q(s) = a + s (b - a)`. An edge may be used if
+Two trees of joint postures grow, one from the start and one from the postures at the goal. They grow towards random
+postures and towards each other (Kuffner and LaValle, "RRT-Connect: an efficient approach to single-query path
+planning", ICRA 2000). An edge is a straight line between two postures, :math:`q(s) = a + s (b - a)`. An edge may be
+used if
 
 .. math:: d(q(s)) \ge d_{req}, \qquad \angle\big(R(q(s)),\, R_0(q(s))\big) \le \tau
 
-for all :math:`s` in [0, 1]. Here d are all distances from the spheres of the arm to obstacles, and between links. The
-certificate of the arm (``arm_certificate``) bounds these distances on the whole edge. R is the rotation of the tool,
-:math:`R_0` the learned rotation at the nearest place of the learned path, and :math:`\tau` the limit of the tilt, which
-is checked at samples of the edge. Nothing else of the demonstrations is used: the planner is a baseline that shows what
-keeping to the demonstrated motion costs, and what it is worth.
+for all :math:`s` in [0, 1]. Here, d stands for every distance from a sphere of the arm to an obstacle and for every
+distance between links. The certificate of the arm (``arm_certificate``) bounds these distances on the whole edge. R is
+the rotation of the tool, :math:`R_0` the learned rotation at the nearest place of the learned path, and :math:`\tau`
+the limit of the tilt. The tilt is checked at samples of the edge. The planner uses nothing else of the demonstrations.
+It is a baseline: a comparison with it shows the costs and the benefits of keeping to the demonstrated motion.
 
-The trees are those of the library ompl. The checks of the edges are written in Python, with all samples of an edge and
-all spheres in one array operation, so most of the planning time is time of this Python code, not of ompl.
+The library ompl grows the trees. The checks of the edges are written in Python; one array operation handles all samples
+of an edge and all spheres. Therefore most of the planning time is spent in this Python code, not in ompl.
 """
 
 from __future__ import annotations
@@ -64,11 +65,11 @@ _SAME_POSTURE = 1e-4  # [m, rad] the joints are planned from exactly where the a
 
 @dataclass(frozen=True, eq=False)
 class TiltLimit:
-    """The largest rotation of the tool away from the learned rotation, at the nearest place of the learned path.
+    """Limit of the tool's tilt: its rotation away from the learned rotation at the nearest place of the learned path.
 
     Attributes:
         learned: the learned path with its rotations, n samples.
-        largest: largest rotation at each sample, shape (n,) [rad].
+        largest: largest permitted rotation at each sample, shape (n,) [rad].
     """
 
     learned: Trajectory
@@ -81,7 +82,7 @@ class TiltLimit:
 
 
 class ClearMotions:
-    """Tells in which postures and on which straight joint motions the arm is clear, and its tool not too tilted.
+    """Tells which postures and which straight joint motions keep the arm's clearances and the limit of the tilt.
 
     Args:
         around: the arm, its obstacles (at rest) and the required clearances.
@@ -110,14 +111,14 @@ class ClearMotions:
 def find_joint_path(
     clear: ClearMotions, start: Array, goals: Sequence[Array], *, seconds: float = 10.0, seed: int = 1
 ) -> Array | None:
-    """Find straight joint motions from one posture to one of several others; shorten them and round off their corners.
+    """Find straight joint motions from one posture to one of several goals; shorten them and round off their corners.
 
     Args:
         clear: which postures and motions may be used.
         start: first posture, shape (n_joints,) [rad].
-        goals: postures of which one is the last posture.
+        goals: postures, each of shape (n_joints,) [rad]; the path ends in one of them.
         seconds: limit of the search's computing time; shortening takes further time [s].
-        seed: seed of the random postures, at least 1. The same seed gives the same path, if the time suffices.
+        seed: seed of the random postures, at least 1. The same seed gives the same path if the computing time suffices.
 
     Returns:
         Corners of the path, shape (m, n_joints) [rad]; None when no path was found in time.
@@ -182,7 +183,7 @@ def _ompl(seed: int) -> tuple[Any, Any]:
 
 
 class RRTConnect(PathPolicy):
-    """Move to the goal on the first clear joint path that a random search finds, without regard to the demonstrations.
+    """Move to the goal on the first clear joint path that a random search finds; the demonstrations are not used.
 
     The search begins in the measured posture and ends in a clear posture with the tool at the goal. The path found by
     :func:`find_joint_path` is shortened, and its execution times keep the limits of the arm and of the safety filter.
@@ -276,9 +277,9 @@ class RRTConnect(PathPolicy):
 class TiltLimitedRRTConnect(RRTConnect):
     """:class:`RRTConnect` with ACFRA's default of ``max_tilt``: two standard deviations of the demonstrations.
 
-    The standard deviation is that of the demonstrated rotation at the nearest place of the learned path. If no
-    orientation was learned, the tool must keep its rotation exactly, which a random search can't: such a skill is
-    refused unless ``max_tilt`` is given.
+    The standard deviation is taken at the nearest place of the learned path. If no orientation was learned, the default
+    requires an exact rotation of the tool, which a random search can't keep. Such a skill is therefore refused unless
+    ``max_tilt`` is given.
     """
 
     def _limits(self, components: ComponentPath) -> Array | None:

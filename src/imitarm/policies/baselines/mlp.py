@@ -18,7 +18,7 @@ _WARM_UP = 0.05  # fraction of the steps in which the step size rises; afterward
 
 @dataclass(frozen=True, eq=False)
 class MLP:
-    """A multilayer perceptron ``x_(i+1) = tanh(x_i W_i + b_i)``, whose last layer has no tanh.
+    """A multilayer perceptron with the layers ``x_(i+1) = tanh(x_i W_i + b_i)``; the last layer has no tanh.
 
     Attributes:
         weights: W_i, each of shape (inputs, outputs).
@@ -33,8 +33,8 @@ class MLP:
         """Return a network with normally distributed weights of variance ``1 / inputs``, and biases of 0.
 
         Args:
-            sizes: numbers of inputs, of units in each layer, and of outputs. The last layer has a tenth of the weights,
-                so that the first outputs are small.
+            sizes: numbers of inputs, of units in each layer, and of outputs. The weights of the last layer are divided
+                by 10, so that the untrained network has small outputs.
             rng: source of the random weights.
         """
         weights = [rng.normal(size=pair) / np.sqrt(pair[0]) for pair in pairwise(sizes)]
@@ -87,8 +87,8 @@ def train(
 
     Args:
         network: the network to start from; it is not changed.
-        gradient: function from a network and the indices of a batch (batch,) to the derivatives of the loss, in the
-            order of :meth:`MLP.gradient`.
+        gradient: function that takes a network and the indices of a batch (batch,). It returns the derivatives of the
+            loss, in the order of :meth:`MLP.gradient`.
         n_samples: number of samples from which the batches are drawn.
         rng: source of the random batches.
         steps: number of steps.

@@ -28,21 +28,21 @@ def modulated(desired: Array, around: NearObstacles, *, reactivity: float = 1.0,
         v = M (u - v_o) + v_o,   M = E diag(1 - q, 1 + q, 1 + q) E^-1,   E = [r, e_1, e_2],   e_i . n = 0
         q = Gamma^(-1 / reactivity),   Gamma = (1 + gap / (reach size))^2
 
-    ``Gamma`` is 1 where the gap is 0, so that the tool does not move along the normal there. For a sphere with
-    ``reach`` and ``reactivity`` 1, ``Gamma`` is the squared distance from the centre in radii, and in a plane through
-    the centre, the field is the potential flow about a circle. Where the tool is already too close, ``q`` is above 1,
-    which leads the tool out; a velocity away from the obstacle is not reduced.
+    ``Gamma`` is 1 where the gap is 0, so that the tool does not move along the normal there. For a sphere, if ``reach``
+    and ``reactivity`` are 1, ``Gamma`` is the squared distance from the centre divided by the squared radius. In a
+    plane through the centre, the field is then the potential flow about a circle. If the tool is already too close,
+    ``q`` is above 1, and the modulation leads the tool out. A velocity away from the obstacle is not reduced.
 
     For several obstacles, the norms and the directions of the velocities are averaged with the weights ``w_o =
-    prod_(i != o) (Gamma_i - 1)``, normalised to the sum 1. A direction is represented by its angle from ``u``.
-    Where the tool is already too close to obstacles, only these have weights, ``1 - Gamma_o``, and the velocities are
-    averaged as vectors.
+    prod_(i != o) (Gamma_i - 1)``, normalised to the sum 1. The mean direction is computed from the angles between each
+    direction and ``u``. If the tool is already too close to some obstacles, only these obstacles count. Their weights
+    are then ``1 - Gamma_o``, and their velocities are averaged as vectors.
 
     Args:
         desired: u, shape (d,) [m/s].
         around: the obstacles.
-        reactivity: larger values act from farther away.
-        reach: scale of the obstacles' sizes.
+        reactivity: with a larger value, an obstacle acts from farther away.
+        reach: factor of the obstacles' sizes; with a larger value, an obstacle acts from farther away.
 
     Returns:
         Shape (d,) [m/s].
@@ -91,8 +91,8 @@ class Modulation(VelocityField):
 
     Args:
         skill: skill to reproduce.
-        reactivity: larger values act from farther away.
-        reach: scale of the obstacles' sizes.
+        reactivity: with a larger value, an obstacle acts from farther away.
+        reach: factor of the obstacles' sizes; with a larger value, an obstacle acts from farther away.
         options: arguments of :class:`~imitarm.policies.baselines.velocity_field.VelocityField`.
     """
 

@@ -1,8 +1,8 @@
 r"""The cost of a path in the baseline ``gmm-irl``: features, their derivatives, and local minima.
 
 A path is the nominal path ``x_i`` plus a deviation ``d_i``, at 100 equal time steps. The first and the last three
-deviations are 0. With the covariance ``Sigma_i`` of the demonstrations and the gap ``g_oi`` of sample ``i`` to obstacle
-``o``, the cost is ``J = sum_k w_k phi_k`` with the features::
+deviations are 0. Let ``Sigma_i`` be the covariance of the demonstrations at sample ``i``, and ``g_oi`` the gap of this
+sample to obstacle ``o``. The cost is ``J = sum_k w_k phi_k`` with the following features ``phi_k``::
 
     deviation       mean_i d_i^T (Sigma_i + (5 mm)^2 I)^-1 d_i
     jerk            n^5 sum_i |third difference of d at i|^2                     [m^2], as for a duration of 1
@@ -41,17 +41,17 @@ _free = slice(FIXED, -FIXED)
 
 @dataclass(frozen=True, eq=False)
 class PathCost:
-    """The features of paths in one scene. Deviations have shape (94, k), in the k allowed directions.
+    """The features of paths in one scene. Deviations have shape (94, k) [m] and are expressed in k allowed directions.
 
     Attributes:
         nominal: nominal path at equal time steps, shape (100, 3) [m].
         covariances: covariances of the demonstrations at the samples, shape (100, 3, 3) [m^2].
         times: times of the samples since the motion began, shape (100,) [s].
-        gaps: distances to the obstacles; moving obstacles are taken at the time of each sample.
+        gaps: distances to the obstacles; a moving obstacle is placed where it is at the time of each sample.
         margin: distance that is subtracted from each gap [m].
         axes: orthonormal basis of the allowed directions, as columns, shape (3, k).
-        one_sided: directions in which the path must not be displaced, in this basis, shape (m, k); they are treated
-            like contact.
+        one_sided: directions in which the path must not be displaced, in the basis ``axes``, shape (m, k); a
+            displacement in such a direction has the same cost as contact.
     """
 
     nominal: Array
@@ -104,9 +104,10 @@ class PathCost:
         return np.stack([quadratic, 2.0 * self.smoothness @ deviation, *rows])
 
     def blocks(self, deviation: Array) -> Array:
-        """Return the second derivatives of the features within each sample, shape (6, 94, k, k).
+        """Return the second derivatives of the features with respect to the same sample, shape (6, 94, k, k).
 
-        The feature "jerk" couples samples; its Hessian is ``2 smoothness`` for each direction, and its row here is 0.
+        The feature "jerk" couples different samples, so its entry here is 0; its Hessian is ``2 smoothness`` for each
+        direction.
         """
         gap, normal = self._gaps(deviation)
         curvature = self._curvatures(deviation)
@@ -155,8 +156,9 @@ class PathCost:
     def minimised(self, weights: Array, start: Array) -> Array:
         """Return the local minimum of J that L-BFGS reaches from a deviation (94, k).
 
-        The variable is ``y = U d`` with the Cholesky factor U of the Hessian of the two quadratic features. For these,
-        the cost is ``|y|^2 / 2``, so that L-BFGS converges in few iterations.
+        The optimiser works with ``y = U d`` instead of the deviation d, where U is the Cholesky factor of the Hessian
+        of the two quadratic features. The cost of these features is then ``|y|^2 / 2``, so L-BFGS converges in few
+        iterations.
         """
         quadratic = np.zeros_like(weights)
         quadratic[:2] = weights[:2]

@@ -4,12 +4,12 @@ The module uses the same gradient descent for two potentials. Let ``d`` be the d
 component's ellipse, ``n`` the outward normal and ``sigma(n) = sqrt(n^T Sigma n)`` the component's spread towards the
 obstacle.
 
-* ``literal``: Eq 4.7 as printed, ``U = 1/2 k (1/d - 1/d_th)^2 - exp(sigma^2)``. The term ``exp(sigma^2)`` does
-  not depend on the position, so it drops out of the force, and the spread has no effect.
+* ``literal``: Eq 4.7 as printed, ``U = 1/2 k (1/d - 1/d_th)^2 - exp(sigma^2)``. The term ``exp(sigma^2)`` does not
+  depend on the position, so the force does not contain the term, and the spread has no effect.
 * ``mapf``: a dimensionless potential with the effect that the thesis describes in words:
   ``U = 1/2 eta s d_th^2 (1/rho - 1)^2`` with ``rho = d / d_th``. The gain ``s = exp((sigma(n)^2 - median) / max)``
   pushes components with a large spread farther than components with a small spread. Here, ``median`` and ``max`` are
-  those of ``sigma(n)^2``.
+  the median and the maximum of ``sigma(n)^2`` over the components.
 
 Neither potential checks whether the path *between* two pushed means is clear. Two components on opposite sides of an
 obstacle are pushed apart, so the path between them passes through the obstacle. Both potentials are kept for
@@ -41,9 +41,9 @@ def component_distances(
 ) -> tuple[Array, Array, Array]:
     """Return the distances of the components' one-sigma ellipses from the inflated obstacles.
 
-    ``d = sd(mu) - sqrt(n^T Sigma n) - margin``: the ellipse's extent towards the obstacle is subtracted from the
-    distance of its centre. The result is exact for spheres, and a lower bound for every convex obstacle that does not
-    contain the centre.
+    The distance is ``d = sd(mu) - sqrt(n^T Sigma n) - margin``: the signed distance of the ellipse's centre ``mu``,
+    minus the ellipse's extent towards the obstacle, minus the margin. The result is exact for spheres, and a lower
+    bound for every convex obstacle that does not contain the centre.
 
     Returns:
         distances (n_obstacles, n_components) [m], normals (n_obstacles, n_components, 3) and spreads
@@ -59,7 +59,7 @@ def literal_force(distance: Array, normal: Array, spread: Array) -> Array:
     """Return the force of Eq 4.7 as printed, ``k (1/d - 1/d_th) / d^2 n`` with k = 1.
 
     Args:
-        distance: distance from the ellipse to the obstacle, (n_obstacles, n_components) [m].
+        distance: distance from each ellipse to each obstacle, (n_obstacles, n_components) [m].
         normal: outward normals, (n_obstacles, n_components, 3).
         spread: not used, because ``exp(sigma^2)`` does not depend on the position, so its gradient is zero.
     """
@@ -72,7 +72,7 @@ def modified_force(distance: Array, normal: Array, spread: Array) -> Array:
     """Return the force ``s d_th (1/rho - 1) / rho^2 n`` of the modified potential (docs/avoidance.md, 10).
 
     Args:
-        distance: distance from the ellipse to the obstacle, (n_obstacles, n_components) [m].
+        distance: distance from each ellipse to each obstacle, (n_obstacles, n_components) [m].
         normal: outward normals, (n_obstacles, n_components, 3).
         spread: sigma(n), (n_obstacles, n_components) [m]; the gain uses the median and the maximum of the squared
             spreads.
@@ -89,7 +89,7 @@ FORCES = {"literal": literal_force, "mapf": modified_force}
 def push_components(
     path: ComponentPath, obstacles: Sequence[Obstacle], margin: float, *, method: str, forbidden: Array
 ) -> Array:
-    """Move the means along the potential's force until no mean is within reach of the force, or for 200 steps.
+    """Move the means along the potential's force until the force on every mean is zero, for at most 200 steps.
 
     Args:
         path: the nominal path and its components.

@@ -1,15 +1,15 @@
 r"""The classical artificial potential field: attraction to the goal, repulsion from obstacles (thesis Eqs 2.15-2.22).
 
-Let ``rho = |x - g|`` be the distance to the goal, and ``d`` the distance to the closest point of an obstacle, with the
-gradient ``n``. The potentials, and the forces as their negative gradients, are::
+Let ``rho = |x - g|`` be the distance from the position x to the goal g. Let ``d`` be the distance to the closest point
+of an obstacle, and ``n`` the gradient of d. Each force F is the negative gradient of a potential U::
 
     U_a = 1/2 eta rho^2                         F_a = -eta (x - g)                         if rho <= rho_c
     U_a = eta rho_c (rho - rho_c / 2)           F_a = -eta rho_c (x - g) / rho             otherwise
     U_r = 1/2 k (1/d - 1/d_0)^2                 F_r = k (1/d - 1/d_0) d^-2 n               if d <= d_0, else 0
 
 The cap ``rho_c`` limits the attraction far from the goal. The repulsion grows without bound at the surface of an
-obstacle. Below the floor ``d_f``, the force therefore keeps its value at ``d_f``, and the potential is continued as a
-straight line, so that the force is the negative gradient everywhere, also inside an obstacle.
+obstacle. At distances below the floor ``d_f``, the force therefore keeps its value at ``d_f``. The potential continues
+there as a straight line, so the force is the negative gradient of the potential everywhere, even inside an obstacle.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How a baseline moves when the scene changes: one control period at a time, with the obstacles as last observed."""
+"""How a baseline moves when the scene changes: one control period at a time, with the last observed obstacles."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ _SAME = 1e-9  # [m] an obstacle that has moved by less stands where it stood
 
 
 class Reaction(ABC):
-    """The motion of a method whose scene moves or changes.
+    """The motion of a method in a scene whose obstacles move, appear or disappear.
 
-    A baseline plans its path once if the obstacles stand still. If one of them moves, appears or disappears, the same
-    equations are integrated step by step instead, with the obstacles at their current positions and velocities.
+    A baseline plans its path once if the obstacles stand still. If an obstacle moves, appears or disappears, the
+    baseline instead integrates the same equations step by step, with the current positions and velocities of the
+    obstacles.
 
     Args:
         nominal: the learned path between the start and the goal of this motion.
@@ -30,7 +31,7 @@ class Reaction(ABC):
 
     Attributes:
         fraction: fraction of the duration that has passed; above 1 after the learned duration.
-        position: where the tool should be, shape (3,) [m].
+        position: desired position of the tool, shape (3,) [m].
     """
 
     def __init__(self, nominal: Trajectory, position: Array, velocity: Array, fraction: float) -> None:
@@ -62,11 +63,11 @@ class Reaction(ABC):
 
     @abstractmethod
     def step(self, scene: Scene, dt: float) -> None:
-        """Move ``position`` by one control period, and ``fraction`` with it."""
+        """Move ``position`` and ``fraction`` by one control period."""
 
 
 def changed(before: PackedObstacles, now: PackedObstacles) -> bool:
-    """Return whether obstacles move, or are not those, or not where, they were."""
+    """Return whether an obstacle moves, or differs in position from before, or the number of obstacles differs."""
     if not now.still or len(before) != len(now):
         return True
     return bool(np.abs(before.positions - now.positions).max(initial=0.0) > _SAME)

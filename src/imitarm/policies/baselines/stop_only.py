@@ -1,4 +1,4 @@
-"""Stop-only: speed and separation monitoring, which stops the arm where others would go around."""
+"""Stop-only: speed and separation monitoring, which stops the arm where other methods go around an obstacle."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ class StopOnly(Policy):
 
     .. math:: S = v_h (T_r + T_s) + v_r T_r + S_s + C + Z_d + Z_r
 
-    with the speed :math:`v_h` of the obstacle towards the tool, the reaction time :math:`T_r`, the stopping time
-    :math:`T_s = v_r / a` and distance :math:`S_s = v_r^2 / (2 a)` of the tool with its speed :math:`v_r`, the intrusion
-    distance C, and the uncertainties of the obstacle's and the tool's position. Here, :math:`v_h` is the tracked speed
-    along the line to the tool, at least 0; :math:`v_r` is the learned speed that the tool would have; and :math:`Z_d`
-    is two standard deviations of the tracked position along the line. The phase of the path slows down with a and
-    starts again with a.
+    Here, :math:`v_h` is the tracked speed of the obstacle along the line to the tool, at least 0, and :math:`v_r` is
+    the speed of the tool on the learned path. :math:`T_r` is the reaction time. With the deceleration a, the tool has
+    the stopping time :math:`T_s = v_r / a` and the stopping distance :math:`S_s = v_r^2 / (2 a)`. C is the intrusion
+    distance. :math:`Z_d` is the uncertainty of the obstacle's position: two standard deviations of the tracked position
+    along the line. :math:`Z_r` is the uncertainty of the tool's position. When the tool stops or starts again, its
+    progress along the path changes with the deceleration or acceleration a.
 
-    **Known failure.** The tool never leaves the path. An obstacle that moves into the standing tool hits it, and an
-    obstacle that stays stops the motion for ever.
+    **Known failure.** The tool never leaves the path. An obstacle that moves towards the standing tool hits the tool.
+    An obstacle that stays near the path stops the motion for ever.
 
     Args:
         skill: skill to reproduce.
@@ -116,7 +116,7 @@ class StopOnly(Policy):
         return bool(away < _ARRIVED)
 
     def separation(self, approach: Array, speed: float, uncertainty: Array) -> Array:
-        """Return S for each obstacle, shape (n,) [m].
+        """Return the protective separation distance S of each obstacle, shape (n,) [m].
 
         Args:
             approach: v_h, shape (n,) [m/s].

@@ -30,12 +30,14 @@ _SAMPLES = 200  # of each demonstration
 class FrameMixture(NamedTuple):
     r"""A Gaussian mixture that is known in two frames, at the start and at the goal of a motion.
 
-    With ``z_1 = [t; x - start]`` and ``z_2 = [t; x - goal]``, component k is the Gaussian ``N(mu_k^j, Sigma_k^j)`` in
-    frame j. For a new start and goal, each component is the product of its two Gaussians, moved to the base frame::
+    Frame 1 describes a motion by ``z_1 = [t; x - start]``, and frame 2 by ``z_2 = [t; x - goal]``. In frame j,
+    component k is the Gaussian ``N(mu_k^j, Sigma_k^j)``. For a new start and goal, each component is the product of its
+    two Gaussians, moved to the base frame::
 
         Sigma_k^-1 = sum_j (Sigma_k^j)^-1,     mu_k = Sigma_k sum_j (Sigma_k^j)^-1 (mu_k^j + [0; b_j])
 
-    with ``b_1`` the start and ``b_2`` the goal. A frame in which the demonstrations agree therefore decides.
+    Here, ``b_1`` is the start and ``b_2`` is the goal. The frame in which the demonstrations agree better therefore has
+    more influence.
 
     Attributes:
         weights: shape (K,).
@@ -80,8 +82,9 @@ class FrameMixture(NamedTuple):
 def demonstrations_between_ends(skill: Skill, spread: float) -> list[Trajectory]:
     """Return demonstrations with different starts and goals, made from a skill.
 
-    They are the seven paths of :func:`~imitarm.policies.baselines.gmm_dmp.reconstructed_demonstrations`, each moved as
-    the skill's nominal path moves when its start or its goal is displaced by ``spread`` [m] along each axis, both ways.
+    The start or the goal is displaced by ``spread`` [m] in both directions along each axis, which changes the skill's
+    nominal path. Each of the seven paths of :func:`~imitarm.policies.baselines.gmm_dmp.reconstructed_demonstrations` is
+    then changed in the same way.
     """
     times = np.linspace(0.0, skill.duration_, _SAMPLES)
     learned = skill.nominal(times).positions
@@ -103,18 +106,18 @@ class TPGMM(CoupledMotion):
 
         T^2 x'' = K (y(t) - x) - D T x' + Phi,     Phi = sum k (1/d - 1/d_0) d^-2 n     (thesis Eq 2.19)
 
-    with the attractor ``y`` of a primitive that is fitted to ``x(t)``. The published method avoids an obstacle only if
-    the obstacle was a frame in the demonstrations. Demonstrations of a skill contain none, so ``Phi`` replaces it;
-    ``force=0`` is the method without avoidance.
+    Here, ``y`` is the attractor of a primitive that is fitted to ``x(t)``. The published method avoids an obstacle only
+    if the obstacle was a frame in the demonstrations. The demonstrations of a skill contain no obstacle, so the
+    repulsion ``Phi`` is used instead. With ``force=0``, the method does not avoid obstacles.
 
     Args:
         skill: skill to reproduce.
         demonstrations: demonstrations with different starts and goals; None: :func:`demonstrations_between_ends`,
             because a skill does not keep its demonstrations.
-        spread: displacement of the starts and goals of these [m].
+        spread: displacement of the starts and goals in :func:`demonstrations_between_ends` [m].
         force: k [m^4].
         influence: d_0 [m].
-        n_components: number of Gaussians; None: that of the skill.
+        n_components: number of Gaussians; None: the skill's number.
         options: arguments of :class:`~imitarm.policies.baselines.coupled_motion.CoupledMotion`.
     """
 

@@ -28,14 +28,14 @@ _LARGEST_SIZE = 0.3  # [m] of an obstacle without bounds, such as a table
 
 
 class NearObstacles(NamedTuple):
-    """The obstacles as seen from the tool, in the d directions in which the tool may be displaced.
+    """Distances and directions from the obstacles to the tool, in the d directions in which it may be displaced.
 
     Attributes:
         gap: distance of the tool to each obstacle, minus the required clearance, shape (n,) [m].
         normal: outward normals, shape (n, d); shorter than 1 if part of a normal lies in a forbidden direction.
         velocity: velocity of each obstacle at its closest point, shape (n, d) [m/s].
         drift: the part of the tool's velocity in forbidden directions, projected on each normal, shape (n,) [m/s].
-        outward: vectors from the centres of the obstacles to the tool, shape (n, d) [m]; the normal for a half-space.
+        outward: vectors from the centres of the obstacles to the tool, shape (n, d) [m]; for a half-space, its normal.
         size: radius of a sphere that contains the obstacle, plus the tool's radius and the clearance, shape (n,) [m].
     """
 
@@ -67,20 +67,22 @@ _Around = tuple[ToolGaps, PackedObstacles, float]
 
 
 class VelocityField(BaselinePolicy):
-    r"""Let the tool follow a point that moves along the learned path, with a velocity that respects obstacles.
+    r"""Let the tool follow a point that moves along the learned path; near obstacles, the tool's velocity is changed.
 
-    The desired velocity ``u`` follows the point ``x_0(s)``; the point waits for a tool that lags::
+    The desired velocity ``u`` of the tool at ``x`` follows the point ``x_0(s)`` of the learned path, with the phase
+    ``s`` [s]. If the tool lags behind, the point slows down to a rate r below 1::
 
         u = r dx_0/ds + k (x_0(s) - x),     ds/dt = r = 1 / (1 + |x_0(s) - x| / e_0)
 
     The norm of ``u`` is limited to 1.5 times the highest speed of the learned path. A subclass implements
     :meth:`velocity`, which changes ``u`` near obstacles, and the tool moves with ``dx/dt = velocity(u)``. The motion
-    ends at the goal. A method whose tool is not within 5 mm of the goal after twice the learned duration refuses.
+    ends at the goal. If the tool is not within 5 mm of the goal after twice the learned duration, the method refuses
+    the scene.
 
     Args:
         skill: skill to reproduce.
         pull: k, stiffness of the path [1/s].
-        slack: e_0, the distance at which the point has half of its speed [m].
+        slack: e_0, the distance between tool and point at which the point moves at half of its learned speed [m].
         options: arguments of :class:`~imitarm.policies.baselines.baseline_policy.BaselinePolicy`.
     """
 
@@ -101,8 +103,8 @@ class VelocityField(BaselinePolicy):
         Args:
             desired: desired velocity in the allowed directions, shape (d,) [m/s].
             around: the obstacles.
-            limits: largest velocity in each direction ``self.one_sided``, shape (m,) [m/s]. A result that exceeds a
-                limit is reduced to it.
+            limits: largest velocity in each direction ``self.one_sided``, shape (m,) [m/s]. If the result exceeds a
+                limit, it is reduced to the limit.
         """
 
     def tool_path(self, nominal: Trajectory, gaps: ToolGaps, scene: Scene) -> tuple[Array, Array]:
@@ -136,9 +138,9 @@ class VelocityField(BaselinePolicy):
 
         Args:
             x: position before, shape (3,) [m].
-            phase: index of the point on the learned path.
-            follow: the learned path, and the step.
-            around: gaps, obstacles, and the time since they were where they are in the scene.
+            phase: index of the point on the learned path, as a float.
+            follow: the learned path, the rate of its phase, the length of the step [s], and the largest speed [m/s].
+            around: the gaps, the obstacles, and the time for which they have moved from their poses in the scene [s].
         """
         learned, ratio, dt, fastest = follow
         target = _at(phase, learned)
