@@ -306,7 +306,7 @@ def _frozen(view: _View) -> Iterator[RecordingIssue]:
                     f"in {len(lasting)} periods, the positions of the {what} are exactly the same; "
                     f"the longest period lasts {longest:.2f} s"
                 )
-            remedy = "record again: the other joints move, so the sensor lost this joint"
+            remedy = "record again, because the sensor lost this joint while the other joints moved"
             if what not in joints:
                 remedy = (
                     "repair the recording to drop these frames, which leaves a gap; record again if you need the "

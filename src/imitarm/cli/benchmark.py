@@ -189,7 +189,7 @@ def _add_placements(parsers: Any) -> None:
     placed.set_defaults(benchmark=_placements)
     compared = parsers.add_parser(
         "comparison",
-        help="from saved results, compare a policy with each other policy, where the other policy reached the goal",
+        help="compare a policy with the other policies, in saved results in which the other policy reached the goal",
     )
     compared.add_argument(
         "results", type=Path, nargs="+", metavar="RESULTS", help="files that 'placements --out' wrote"

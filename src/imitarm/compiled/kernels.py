@@ -59,7 +59,7 @@ def library() -> Any:
 
 
 def address(array: NDArray[Any]) -> int:
-    """Return the address of an array's memory; the array must be kept as long as the address is used."""
+    """Return the memory address of an array; the caller must keep the array as long as it uses the address."""
     try:
         return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]  # the fastest way
     except (TypeError, ValueError, BufferError):  # an array that is read-only, empty or not contiguous
@@ -70,7 +70,8 @@ def address(array: NDArray[Any]) -> int:
 class Record:
     """A C structure of whole numbers (``int64_t``), real numbers (``double``), arrays, and lists of other structures.
 
-    Arrays are given by their addresses, and lists by the address of a list of addresses, 0 for None.
+    A field for an array holds the address of the array. A field for a list holds the address of a list of addresses, or
+    0 for None.
 
     The record keeps a reference to each field. A copy in another process contains the addresses of that process.
 
@@ -79,7 +80,7 @@ class Record:
     """
 
     def __init__(self, *fields: int | float | NDArray[Any] | Sequence[Record | None]) -> None:
-        """Write the fields in order; an array of another type or layout than C has must not be given."""
+        """Write the fields in order; each array must have the data type and memory layout that the C code expects."""
         self._fields = fields
         values: list[int] = []
         self._lists: list[NDArray[np.int64]] = []

@@ -142,7 +142,7 @@ def duplicates(measured: Measurements, gate: float) -> list[tuple[int, int]]:
 
 
 def matching_labels(labels: Sequence[str], others: Sequence[str]) -> NDArray[np.bool_] | None:
-    """Return whether label i and other label j may belong to one obstacle, shape (n, m); None if all pairs may."""
+    """Return whether label i and other label j may belong to one obstacle, shape (n, m); None if this holds for all."""
     if not any(labels) or not any(others):
         return None
     return np.array([[not a or not b or a == b for b in others] for a in labels])

@@ -61,8 +61,8 @@ def pushed_cube(seed: int, skill: Skill) -> MovingScene:
     """Return a scene in which a cube is pushed onto the path of the sweep twice (thesis Fig 5.5).
 
     The first push is onto the part of the path before the dirt, the second onto the part behind it, so that the cube
-    never moves the dirt. Size, side, places, times and speeds of the pushes are random. The cube stands still on the
-    path for a while, and is pulled back afterwards.
+    never moves the dirt. Size, side, places, times and speeds of the pushes are random. After each push, the cube
+    stands still on the path for some time, and is then pulled back.
 
     Args:
         seed: seed of the random numbers.
@@ -168,7 +168,7 @@ def exact_cube(truth: MovingScene, robot: SimulatedRobot, seed: int) -> Callable
 
 
 def watched_cube(truth: MovingScene, robot: SimulatedRobot, seed: int) -> CameraObserver:
-    """Observe the cube with a depth camera in front of the table, which watches for one second before the arm moves."""
+    """Observe the cube with a depth camera in front of the table; the camera starts one second before the arm moves."""
     surfaces, fixtures = [table_top(), *standard_fixtures()], truth.scene.fixtures
     return watched(robot, _EYE, _MIDDLE, _WORKSPACE, surfaces=surfaces, fixtures=fixtures, seed=seed)
 

@@ -93,7 +93,7 @@ class SweepTask:
         """Load an arm with the brush.
 
         Args:
-            robot: name of the arm, ``"sawyer"`` or ``"panda"``, or another arm that reaches S, T and G.
+            robot: name of the arm: ``"sawyer"``, ``"panda"``, or another arm that reaches the points S, T and G.
         """
         return ArmModel.load(robot, tool="brush")
 

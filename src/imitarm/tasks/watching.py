@@ -1,4 +1,4 @@
-"""A depth camera in the control loop, which watches the scene from one second before the arm moves."""
+"""A depth camera in the control loop; the camera starts one second before the arm moves."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def camera_in_front(
 
     Args:
         robot: the simulated robot.
-        eye: position of the camera in the base frame (3,) [m].
-        middle: point at which the camera looks, in the base frame (3,) [m].
+        eye: position of the camera in the base frame, shape (3,) [m].
+        middle: point at which the camera looks, in the base frame, shape (3,) [m].
         seed: seed of the noise.
         color: whether the images have colours.
     """
@@ -60,7 +60,7 @@ def looking_at(eye: ArrayLike, target: ArrayLike) -> Pose:
 
 
 def watch(robot: SimulatedRobot, observe: Callable[[float], Scene]) -> None:
-    """Let the robot stand for one second while ``observe`` is called with times from -1 s to 0 s."""
+    """Let the robot stand still for one second, and call ``observe`` with the times from -1 s to 0 s."""
     start = robot.time + WATCHES
     while robot.time < start - 0.5 * PERIOD:
         observe(robot.time - start)
@@ -68,7 +68,7 @@ def watch(robot: SimulatedRobot, observe: Callable[[float], Scene]) -> None:
 
 
 def delayed(truth: MovingScene) -> MovingScene:
-    """Return the scene one second later: its time is 0 when the arm, after one second of watching, begins to move."""
+    """Return the scene with all motions delayed by one second, the time for which the camera watches first."""
     motions = {key: lambda time, motion=motion: motion(time - WATCHES) for key, motion in truth.motions.items()}
     return MovingScene(replace(truth.scene.at(truth.scene.stamp - WATCHES), stamp=truth.scene.stamp), motions)
 
@@ -84,17 +84,18 @@ def watched(
     fixtures: Sequence[Obstacle] = (),
     seed: int = 0,
 ) -> CameraObserver:
-    """Watch the scene for one second with a depth camera, and return the camera as ``observe`` of a control loop.
+    """Observe the scene for one second with a depth camera, and return the function ``observe`` of a control loop.
 
     A detector finds the obstacles in the images of the camera, and a tracker follows them. The scene must be
     :func:`delayed`.
 
     Args:
         robot: the simulated robot, at rest.
-        eye: position of the camera in the base frame (3,) [m].
-        middle: point at which the camera looks, in the base frame (3,) [m].
+        eye: position of the camera in the base frame, shape (3,) [m].
+        middle: point at which the camera looks, in the base frame, shape (3,) [m].
         workspace: lowest and highest corner of the box in which obstacles are searched, shape (2, 3) [m].
-        surfaces: known surfaces, which are no obstacles. They must not be larger than in the world.
+        surfaces: known surfaces, which are not obstacles. They must not be larger than the surfaces in the simulated
+            world.
         goal: goal of the observed scenes.
         fixtures: fixtures of the observed scenes.
         seed: seed of the camera's noise.
