@@ -142,17 +142,22 @@ def _scaling(results: StaticResults) -> Found:
     return ("; ".join(parts) or "not run"), _verdict([loss > ours for loss in rates.values()])
 
 
+def _three_digits(value: float) -> str:
+    """Return a number with three significant digits and without an exponent, such as 1420 or 7.43."""
+    return f"{float(f'{value:.3g}'):.6g}"
+
+
 def _cheaper(name: str, unit: str, factor: float) -> Callable[[StaticResults], Found]:
     def evaluate(results: StaticResults) -> Found:
         ours = [r.value(name) for r in results.of(OURS, results.usual) if math.isfinite(r.value(name))]
         if not ours:
             return _NOT_RUN
         base = float(np.median(ours))
-        parts, held = [f"{OURS}: {factor * base:.3g} {unit}"], []
+        parts, held = [f"{OURS}: {_three_digits(factor * base)} {unit}"], []
         for row in _theirs(results):
             values = [r.value(name) for r in results.of(row, results.usual) if math.isfinite(r.value(name))]
             if values:
-                parts.append(f"{row}: {factor * float(np.median(values)):.3g} {unit}")
+                parts.append(f"{row}: {_three_digits(factor * float(np.median(values)))} {unit}")
                 held.append(base < float(np.median(values)))
         return f"medians: {'; '.join(parts)}", _verdict(held)
 
