@@ -68,8 +68,8 @@ def comparison_table(results: Results, tasks: Sequence[str]) -> Table:
     note = (
         "↑ marks measures for which a larger value is better. For all other measures, a smaller value is better. "
         "Intervals are computed by resampling the persons. The p-value is computed by sign flips of the persons' "
-        "differences. and corrected for the number of methods that are compared in each measure. Pairs: recordings "
-        "for which both methods have a value."
+        "differences. Holm's method corrects it for the number of methods that are compared in each measure. Pairs: "
+        "recordings for which both methods have a value."
     )
     return Table(f"Paired comparison: {', '.join(tasks)}", columns, tuple(rows), note)
 

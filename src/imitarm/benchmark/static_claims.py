@@ -268,7 +268,7 @@ _CLAIMS: tuple[tuple[str, Callable[[StaticResults], Found]], ...] = (
     ("cost of ACFRA over the number of obstacles", _cost),
     ("check: a tool that aims at the obstacle never succeeds", _control("aims-at-obstacle", 0.0)),
     ("check: without avoidance, at most 2 % of the runs succeed", _control("no-avoidance", _TOY)),
-    ("check: no method keeps the clearance where the oracle proves it impossible", _beyond_oracle),
+    ("check: no method keeps the clearance where the oracle proves that no path can", _beyond_oracle),
 )
 
 

@@ -80,10 +80,11 @@ class ArmMemory:
         angular: last three rows of ``jacobian``.
         sites: positions of the sites in the base frame, shape (nsite, 3) [m].
         force: generalised forces, shape (nv,).
-        centers: centres of the spheres that cover the arm, once they have been computed for the posture.
+        centers: centres of the spheres that cover the arm, shape (m, 3) [m]; None until they are computed for the
+            posture.
         posture: the joint positions as bytes.
         n_joints: number of the arm's joints.
-        kept: memory that compiled code uses again in every step, by purpose.
+        kept: arrays that compiled code uses again in every step, by the name of their purpose.
     """
 
     def __init__(

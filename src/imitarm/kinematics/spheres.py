@@ -37,7 +37,7 @@ class SphereCover:
         dofs: index of each joint's velocity in the model, shape (n_joints,).
         owners: index of the body that carries each sphere, shape (m,).
         local: centers of the spheres in the frames of these bodies, shape (m, 3) [m].
-        root: body about whose centre of mass MuJoCo gives the twists of the joints.
+        root: a body; MuJoCo gives the twists of the joints about the centre of mass of this body.
     """
 
     def __init__(self, model: mujoco.MjModel, working: mujoco.MjModel, names: Sequence[str]) -> None:

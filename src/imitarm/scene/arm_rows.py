@@ -53,7 +53,7 @@ def compiled_near_rows(
     velocity: Array | None,
     box: Box,
 ) -> NearRows | None:
-    """Return the rows of ``ClearanceLimit`` by compiled code, which must have been built; None if there is none.
+    """Return the rows of ``ClearanceLimit``, computed by compiled code, which must exist; None if there is no row.
 
     All arrays must be contiguous.
 
@@ -62,10 +62,10 @@ def compiled_near_rows(
         cover: spheres that cover the arm.
         memory: the kinematics of the posture.
         scene: obstacles predicted for the current time, with their velocities.
-        reach: distance of each sphere's centre within which obstacles have rows, shape (m,) [m].
-        margins: distance added to the clearance of each obstacle, shape (n,) [m]; None: nothing.
-        velocity: joint velocity, shape (n_joints,) [rad/s]; None: at rest.
-        box: bounds of the joint velocity; rows that no velocity within them violates are left out.
+        reach: for each sphere, the largest distance from its centre to an obstacle that has a row, shape (m,) [m].
+        margins: distance added to the clearance of each obstacle, shape (n,) [m]; None: nothing is added.
+        velocity: joint velocity, shape (n_joints,) [rad/s]; None: the arm is at rest.
+        box: bounds of the joint velocity; rows that no velocity within these bounds violates are left out.
     """
     packed = scene.packed
     record, dt = _record_of(packed)
@@ -95,16 +95,17 @@ class OwnRows(NamedTuple):
 
 
 class Nearness(NamedTuple):
-    """Which pairs of spheres are near.
+    """Defines which pairs of spheres are near.
 
-    Every pair closer than ``close`` is near, but at most the ``most`` closest ones. So is the closest pair of each of
-    the ``n_groups`` closest groups, if this pair is closer than ``within``.
+    A pair is near if its distance is less than ``close``; if there are more than ``most`` such pairs, only the ``most``
+    closest pairs are near. In addition, the closest pair of each of the ``n_groups`` closest groups is near if its
+    distance is less than ``within``.
 
     Attributes:
-        n_groups: see above.
-        within: see above [m].
-        close: see above [m].
-        most: see above.
+        n_groups: number of groups whose closest pair may be near.
+        within: distance below which the closest pair of a group is near [m].
+        close: distance below which any pair is near [m].
+        most: largest number of near pairs.
     """
 
     n_groups: int
@@ -114,12 +115,12 @@ class Nearness(NamedTuple):
 
 
 class Demand(NamedTuple):
-    """The inequality for each pair: its distance may shrink by ``gain`` times what exceeds the clearance.
+    """The inequality for each pair: its distance may shrink at most at the rate ``gain * (distance - clearance)``.
 
     Attributes:
-        clearance: [m].
-        gain: [1/s].
-        retreat: replaces ``gain`` while the distance is below the clearance [1/s].
+        clearance: required distance of each pair [m].
+        gain: factor in the inequality [1/s].
+        retreat: factor that replaces ``gain`` while the distance is below the clearance [1/s].
     """
 
     clearance: float
@@ -157,7 +158,7 @@ class SpherePairs:
         return address(self.cover.base_centers)
 
     def distances(self, centers: Array) -> Array:
-        """Return the distances of all pairs, shape (k,) [m]; ``centers`` (m, 3) [m] are those of the arm's spheres."""
+        """Return the distances of all pairs, shape (k,) [m]; ``centers`` (m, 3) [m] has the arm's centres."""
         every = np.concatenate([centers, self.cover.base_centers])
         between = every.take(self.outer, axis=0) - every.take(self.inner, axis=0)
         between *= between
@@ -173,10 +174,10 @@ class SpherePairs:
         Args:
             arm: the arm.
             q: joint positions, shape (n_joints,) [rad].
-            nearness: which pairs are near.
+            nearness: definition of the near pairs.
             demand: the inequality for each pair.
-            box: bounds of the joint velocity; if no velocity within them violates any inequality, the result may be
-                None.
+            box: bounds of the joint velocity; if no velocity within these bounds violates an inequality, the result may
+                be None.
         """
         kernel = library()
         if kernel is None:

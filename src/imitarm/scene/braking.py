@@ -23,9 +23,9 @@ Array = NDArray[np.float64]
 APPROACH_RATE = 6.0
 """A distance to an obstacle never shrinks by more than this fraction of itself per second [1/s]."""
 LONGEST_YIELD = 1.5
-"""The arm begins to yield to an obstacle at most this time before it would be touched, times one half [s]."""
+"""Upper limit of the time t in which a part of the arm reaches the speed of an obstacle [s]."""
 SHARE = 0.1
-"""Only this fraction is counted of the acceleration that all joints together could give to a part of the arm."""
+"""Fraction of the acceleration that all joints together could give to a part of the arm; only this part is used."""
 
 
 def shrink_rates(

@@ -135,10 +135,10 @@ class SelfClearance:
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
-            box: bounds of the joint velocity; None: the rows are returned whatever the velocity is.
+            box: bounds of the joint velocity; None: rows are returned even if no velocity could violate them.
 
         Returns:
-            None when nothing is near, or when no velocity in the box violates any inequality.
+            The inequalities; None if no pair is near, or if no velocity in the box violates an inequality.
         """
         found = self._found(q, box)
         if found is None:

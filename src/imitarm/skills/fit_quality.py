@@ -52,9 +52,9 @@ class FitQuality:
     """Measures of how well a skill fits its demonstrations.
 
     The bias is the root mean square distance between the skill and the average of the demonstrations at the same times.
-    Differences between demonstrations do not count as bias; they are the skill's tolerance. A skill with a bias above 5
-    % of the motion's extent is not :attr:`faithful`. A skill whose path is much shorter than the average motion is not
-    faithful either, because it has lost bends.
+    Differences between demonstrations do not count as bias; the skill uses them as its tolerance. A skill with a bias
+    above 5 % of the motion's extent is not :attr:`faithful`. A skill whose path is much shorter than the average motion
+    is not faithful either, because it has lost bends.
 
     Attributes:
         distances: distances of the nominal path to each demonstration.

@@ -354,8 +354,8 @@ def try_numbers_of_components(
         numbers: numbers K of components to try.
         min_std: smallest standard deviation with which each column counts as moving, in the column's unit.
         reg_covar: smallest eigenvalue of a covariance relative to the variances of the columns.
-        more: further numbers to try, in this order, while every bias so far is above 1 % of the motion's extent, or
-            every learned path is shorter than 95 % of the motion.
+        more: further numbers, which are tried in this order as long as every bias is above 1 % of the motion's extent,
+            or every learned path is shorter than 95 % of the motion.
 
     Raises:
         InputError: when there are fewer samples than the smallest number of components.
