@@ -11,7 +11,7 @@ import pytest
 
 from imitarm import cli
 from imitarm.benchmark.moving import OURS, MovingExperiment, build, default_methods, method_names
-from imitarm.benchmark.moving_controls import Grid, search
+from imitarm.benchmark.moving_controls import Grid, cells, cheapest, search
 from imitarm.benchmark.moving_measures import Contact, contacts, limits_kept, measured, tracking
 from imitarm.benchmark.moving_motions import AWAY, appearing, stop_and_go, turning, weaving
 from imitarm.benchmark.moving_results import RESULTS, MovingResults
@@ -262,10 +262,43 @@ def test_the_search_goes_around_a_wall_and_waits_for_a_gate():
 def test_controls_do_what_they_must():
     outcomes = {
         name: [MovingExperiment(family, 2, 1000, name).run().outcome for family in ("M1", "M2")]
-        for name in ("no-avoidance", "aims-at-obstacle", "oracle-future")
+        for name in ("no-avoidance", "aims-at-obstacle", "oracle-future", "oracle-tracks")
     }
     assert set(outcomes["no-avoidance"]) == set(outcomes["aims-at-obstacle"]) == {"contact"}
-    assert set(outcomes["oracle-future"]) <= {"success", "too near"}
+    assert set(outcomes["oracle-future"] + outcomes["oracle-tracks"]) <= {"success", "too near"}
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_causal_oracle_finds_the_cheapest_chain_of_cells(dimension):
+    grid = cells(dimension)
+    middle = int(np.argmin(np.sum(grid.deviations**2, axis=1)))
+    np.testing.assert_array_equal(grid.deviations[middle], np.zeros(3))
+    costs = np.tile(np.sum(grid.deviations**2, axis=1), (7, 1))
+    assert set(cheapest(costs, middle, grid).tolist()) == {middle}
+    blocked = costs.copy()
+    blocked[3, np.linalg.norm(grid.deviations, axis=1) < 0.07] = 100.0
+    chain = grid.deviations[cheapest(blocked, middle, grid)]
+    assert np.linalg.norm(chain[3]) >= 0.07
+    assert np.linalg.norm(chain[[0, -1]], axis=1).max() < 0.07
+    assert np.linalg.norm(np.diff(chain, axis=0), axis=1).max() <= np.sqrt(grid.lengths.max()) + 1e-12
+    own, new = costs, np.random.default_rng(1).uniform(size=costs.shape)
+    for values in (own, new):  # never dearer than chains that are made at random
+        best = total_of(cheapest(values, middle, grid), values, grid)
+        for seed in range(20):
+            assert best <= total_of(random_chain(np.random.default_rng(seed), middle, grid), values, grid) + 1e-12
+
+
+def total_of(chain, costs, grid):
+    steps = np.diff(grid.deviations[chain], axis=0)
+    return costs[np.arange(1, len(chain)), chain[1:]].sum() + 0.3 * np.sum(steps * steps)
+
+
+def random_chain(rng, middle, grid):
+    chain = [middle]
+    for _ in range(6):
+        rows = np.flatnonzero((grid.before == chain[-1]).any(axis=1))
+        chain.append(int(rng.choice(rows)))
+    return np.array(chain)
 
 
 def test_the_sensor_matters_not_only_the_truth():

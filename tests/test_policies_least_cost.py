@@ -156,3 +156,22 @@ def test_the_choice_equals_that_of_all_candidates_computed_one_by_one(seed, kind
     assert found.rate == best[2]
     np.testing.assert_allclose(found.scaled, best[1], atol=1e-12)
     assert 0 <= found.nearest < 3
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_push_spring_and_damper_together_keep_the_acceleration_limit(seed):
+    rng = np.random.default_rng(seed)
+    cost, axes = DistanceCost(0.02, np.array([0.03])), frame(np.array([0.6, 0.8, 0.0]), np.eye(3))
+    chooser = LeastCost(TIMES, GAINS["critical"], 1.5, cost, 20.0, headings(np.eye(3)), limit=10.0)
+    free, start = chooser.response.free(rng.uniform(-0.02, 0.02, (2, 3))), rng.uniform(-0.1, 0.1, 3)
+
+    def predict(rates):
+        xi = start + 0.2 * rates[:, None, None] * TIMES[:, None] * np.array([0.6, 0.8, 0.0])
+        return Prediction((xi + free)[:, :, None], np.zeros((len(rates), len(TIMES)), dtype=bool), np.zeros((1, 3)))
+
+    given = axes, np.empty((0, 3)), np.zeros(3), free, np.eye(3), predict, predicted(rng, margin=0.005)
+    pull = rng.uniform(-4.0, 4.0, 3)
+    found = chooser.choose(*given, pull)
+    assert not found.scaled.any() or np.linalg.norm(20.0 * found.scaled - pull) <= 10.0 + 1e-9
+    unlimited = dataclasses.replace(chooser, limit=np.inf)
+    np.testing.assert_array_equal(unlimited.choose(*given, pull).scaled, chooser.choose(*given).scaled)

@@ -43,10 +43,10 @@ def method_names(world: str = "tool") -> tuple[str, ...]:
 
 
 def default_methods(world: str = "tool") -> tuple[str, ...]:
-    """Return the methods that are compared by default; the slow control ``oracle-tracks`` is left out."""
+    """Return the methods that are compared by default."""
     if world != "tool":
         return (CONTROLS[0], *OURS, "acfra", "dmp-potential", "barrier", "modulation")
-    return tuple(name for name in method_names() if name not in (*_PLAN_ONCE, "oracle-tracks"))
+    return tuple(name for name in method_names() if name not in _PLAN_ONCE)
 
 
 def build(method: str, case: MovingCase, options: Options = (), world: str = "tool") -> Policy:
@@ -143,7 +143,7 @@ class MovingExperiment:
         case = self.case()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of numerical methods in hard scenes: the motion is measured anyway
-            observe = TrackedScene(case.truth, self.sensor, ObstacleTracker())
+            observe = TrackedScene(case.truth, self.sensor, ObstacleTracker("imm", rotations=True))
             return case, run_tool(build(self.method, case, self.options), case, observe)
 
     def run(self) -> MovingResult:

@@ -117,7 +117,7 @@ def run_arm(policy: Policy, case: MovingCase, robot: str, sensor: SensorModel) -
     body = SimulatedRobot(arm, scene=case.truth.scene, motion=case.truth.motions, q=start)
     run, steps = ToolRun(), list[Step]()
     safety = SafetyFilter(arm, dt=DT, clearance=case.clearance)
-    observe = TrackedScene(case.truth, sensor, ObstacleTracker())
+    observe = TrackedScene(case.truth, sensor, ObstacleTracker("imm"))
     try:
         rollout = reproduce(
             _Timed(policy, run),

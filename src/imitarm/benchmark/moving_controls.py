@@ -5,9 +5,10 @@
   wrong.
 * ``oracle-future`` knows the true motion of the obstacles. A scene that this oracle does not solve may have no
   solution.
-* ``oracle-tracks`` knows only the tracked obstacles, as the methods do. It searches again every 0.1 s.
+* ``oracle-tracks`` knows only the tracked obstacles, as the methods do (:class:`CausalOracle`). A contact that this
+  oracle avoids was avoidable.
 
-The oracles search space and time (:func:`search`) and share no code with the compared methods.
+``oracle-future`` searches space and time (:func:`search`). The oracles share no code with the compared methods.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from functools import lru_cache
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +34,7 @@ from imitarm.scene import Scene
 from imitarm.trajectory import Trajectory
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 Gap = Callable[[Array, float], Array]
 """Type of a function of points (n, 3) [m] and a time [s]. The function returns, for a tool at each of the points, the
 gap to the nearest obstacle at that time, shape (n,) [m]."""
@@ -47,8 +50,15 @@ _SPEED = 0.4  # [m/s] at which the tool aims at an obstacle
 _GAIN = 8.0  # [1/s]
 _ARRIVED = 3e-3  # [m]
 _MARGINS = (0.045, 0.03, 0.02, 0.012, 0.006)  # [m] of the oracle, largest first
-_PERIOD = 0.1  # [s] between two searches of the oracle with tracks
-_LATER = 0.3  # durations after the learned one that the oracle with tracks searches
+_LAYERS = 18  # of the causal oracle, in one search
+_AGAIN = 0.1  # [s] between two searches
+_APART = {2: 0.025, 3: 0.04}  # [m] between two deviations
+_BESIDE_IT = {2: 16, 3: 9}  # deviations to each side of the learned motion
+_STEPS = {2: 3, 3: 2}  # deviations that the tool may move between two layers
+_WANTED, _GROWTH = 0.045, 0.05  # [m], [m/s] wanted gap, which grows with the look-ahead
+_NEAR_COST = 100.0  # of the squared lack of gap, relative to the squared distance from the learned motion
+_TOUCHING, _TOUCH_COST = 0.008, 10.0  # [m], [m^2]
+_LOCAL_BLUR = 0.8  # layers: standard deviation of the filter that smooths a chain of deviations
 _AHEAD = 0.97  # of the longest duration, for the arrival
 
 
@@ -194,46 +204,47 @@ class AimsAtNearest(Policy):
 
 
 class Oracle(Policy):
-    """Follow the motion that the search finds, with the true future or with the tracked obstacles.
+    """Follow the motion that the search finds with the true future.
 
     Args:
         case: the scene, with the true future.
-        tracked: True: search with the observed obstacles, every 0.1 s. False: search once, with the true future.
         options: arguments of :class:`~imitarm.policies.Policy`.
     """
 
     title: ClassVar[str] = "oracle"
 
-    def __init__(self, case: MovingCase, *, tracked: bool, **options: Any) -> None:
+    def __init__(self, case: MovingCase, **options: Any) -> None:
         super().__init__(case.skill, **options)
-        self.case, self.tracked = case, tracked
+        self.case = case
         self._nominal = case.skill.nominal(_clock(case.skill.duration_))
         self._grid = Grid.around(self._nominal.positions, planar=case.dimension == 2)
-        self._end = _AHEAD * LATEST * case.skill.duration_
 
     def reset(self, observation: Observation) -> None:
         """Search.
 
         Raises:
-            InfeasibleError: when the true future is known, and no motion is found.
+            InfeasibleError: when no motion is found.
         """
-        self._motion, self._searched = self._nominal, -np.inf
-        if self.tracked:
-            return
-        found = self._found(self._nominal.positions[0], 0.0, self._gap_in_truth())
-        if found is None:
-            raise InfeasibleError("the search finds no motion")
-        self._motion = found
+        del observation
+        radius, truth = float(self.case.tool_spheres[0, 3]), self.case.truth
+        end = _AHEAD * LATEST * self.case.skill.duration_
+
+        def gap(points: Array, time: float) -> Array:
+            return truth.at(time).clearance(points) - radius
+
+        for margin in _MARGINS:
+            found = search(
+                self._grid, self._nominal.positions[0], self._nominal, gap, begin=0.0, end=end, margin=margin
+            )
+            if found is not None and self._is_clear(found):
+                self._motion = found
+                return
+        raise InfeasibleError("the search finds no motion")
 
     def step(self, observation: Observation, dt: float) -> Command:
-        """Return the velocity that follows the last motion that the search found."""
+        """Return the velocity that follows the motion."""
         del dt
-        time, x = observation.time, observation.tool_to_base.position
-        if self.tracked and time - self._searched >= _PERIOD - 1e-9 and time < self._end - 2.0 * _PERIOD:
-            self._searched = time
-            found = self._found(x, time, _gap_in_scene(observation.scene, self.tool_spheres))
-            self._motion = self._motion if found is None else found
-        return _follow(self._motion, time, x)
+        return _follow(self._motion, observation.time, observation.tool_to_base.position)
 
     def finished(self, observation: Observation) -> bool:
         """Return whether the tool is at the goal at the end of the motion."""
@@ -241,31 +252,125 @@ class Oracle(Policy):
         late = min(self._motion.times[-1], self.case.skill.duration_)
         return bool(observation.time >= late and away < _ARRIVED)
 
-    def _found(self, start: Array, begin: float, gap: Gap) -> Trajectory | None:
-        end = self._end
-        if self.tracked:  # a later arrival takes longer to search, and the next search may still choose it
-            end = min(end, max(begin, self.case.skill.duration_) + _LATER * self.case.skill.duration_)
-        for margin in _MARGINS:
-            found = search(self._grid, start, self._nominal, gap, begin=begin, end=end, margin=margin)
-            if found is not None and self._is_clear(found, gap):
-                return found
-        return None
-
-    def _is_clear(self, motion: Trajectory, gap: Gap) -> bool:
-        """Return whether a motion touches nothing, with the obstacles for which it was searched."""
-        if self.tracked:
-            return True
+    def _is_clear(self, motion: Trajectory) -> bool:
+        """Return whether a motion touches nothing."""
         times = np.arange(motion.times[0], motion.times[-1], 0.005)
         points = motion.at(times)[0]
         return bool(distances_in_time(self.case.truth, times, points).min() - self.case.tool_spheres[0, 3] > 0.002)
 
-    def _gap_in_truth(self) -> Gap:
-        radius = float(self.case.tool_spheres[0, 3])
-        return lambda points, time: self.case.truth.at(time).clearance(points) - radius
+
+class Cells(NamedTuple):
+    """The grid of deviations from the learned motion.
+
+    Attributes:
+        deviations: shape (n, 3) [m]; the middle one is 0.
+        before: cells from which each cell can be reached in one layer, shape (n, k); n for cells outside the grid.
+        lengths: squared lengths of these steps, shape (k,) [m^2].
+    """
+
+    deviations: Array
+    before: Indices
+    lengths: Array
 
 
-def _gap_in_scene(scene: Scene, tool_spheres: Array | None) -> Gap:
-    return lambda points, time: ToolGaps(scene.at(time), tool_spheres).gaps(points).min(axis=0, initial=np.inf)
+@lru_cache(maxsize=2)
+def cells(dimension: int) -> Cells:
+    """Return the grid, in the horizontal plane or in space."""
+    half, reach, cell = _BESIDE_IT[dimension], _STEPS[dimension], _APART[dimension]
+    spans = [range(-half, half + 1)] * dimension + [range(1)] * (3 - dimension)
+    grid = np.array(list(itertools.product(*spans)))
+    steps = [range(-reach, reach + 1)] * dimension + [range(1)] * (3 - dimension)
+    moves = np.array([m for m in itertools.product(*steps) if sum(i * i for i in m) <= reach**2])
+    came = grid[:, None] - moves
+    inside = (np.abs(came) <= half).all(axis=2)
+    width = 2 * half + 1
+    number = came[..., 0] + half
+    for axis in range(1, dimension):
+        number = number * width + came[..., axis] + half
+    before = np.where(inside, number, len(grid))
+    return Cells(cell * grid, before, cell**2 * np.sum(moves * moves, axis=1))
+
+
+def cheapest(costs: Array, begin: int, grid: Cells) -> Indices:
+    """Return the chain of cells with the least sum of costs and steps, one cell for each layer.
+
+    Args:
+        costs: cost of each cell in each layer, shape (L, n).
+        begin: cell in the first layer.
+        grid: the cells.
+    """
+    n = len(grid.deviations)
+    total = np.full(n + 1, np.inf)
+    total[begin] = 0.0
+    came = np.empty((len(costs), n), dtype=np.intp)
+    every = np.arange(n)
+    for k in range(1, len(costs)):
+        through = total[grid.before] + _STEP_COST * grid.lengths
+        best = through.argmin(axis=1)
+        came[k] = grid.before[every, best]
+        total[:n] = through[every, best] + costs[k]
+    chain = [int(total[:n].argmin())]
+    for k in range(len(costs) - 1, 0, -1):
+        chain.append(int(came[k][chain[-1]]))
+    return np.array(chain[::-1], dtype=np.intp)
+
+
+class CausalOracle(Policy):
+    """Follow the motion that a search in space and time finds among the tracked obstacles, ten times a second.
+
+    The search covers 0.9 s. A state is a deviation from the learned motion, on a grid. The cost of a state is its
+    squared distance from the learned motion, plus a cost where the predicted gap to an obstacle is less than wanted.
+    Dynamic programming finds the chain of states of least cost.
+
+    Args:
+        case: the scene; only its skill and its dimension are used.
+        options: arguments of :class:`~imitarm.policies.Policy`.
+    """
+
+    title: ClassVar[str] = "oracle with tracks"
+
+    def __init__(self, case: MovingCase, **options: Any) -> None:
+        super().__init__(case.skill, **options)
+        self._nominal = case.skill.nominal(np.linspace(0.0, case.skill.duration_, 400))
+        self._cells = cells(case.dimension)
+
+    def reset(self, observation: Observation) -> None:
+        """Begin the motion."""
+        self._motion, self._searched = self._nominal, -np.inf
+
+    def step(self, observation: Observation, dt: float) -> Command:
+        """Return the velocity that follows the motion found last."""
+        del dt
+        time, x = observation.time, observation.tool_to_base.position
+        if time - self._searched >= _AGAIN - 1e-9:
+            self._searched = time
+            self._motion = self._found(observation.scene, time, x)
+        return _follow(self._motion, time, x)
+
+    def finished(self, observation: Observation) -> bool:
+        """Return whether the tool is at the goal after the learned duration."""
+        away = np.linalg.norm(observation.tool_to_base.position - self._nominal.positions[-1])
+        return bool(observation.time >= self._nominal.times[-1] and away < _ARRIVED)
+
+    def _found(self, scene: Scene, time: float, x: Array) -> Trajectory:
+        times: Array = time + LAYER * np.arange(_LAYERS + 1.0)
+        targets = self._nominal.at(np.minimum(times, self._nominal.times[-1]))[0]
+        deviations = self._cells.deviations
+        first = x - targets[0]
+        begin = int(np.argmin(np.sum((deviations - first) ** 2, axis=1)))
+        away = np.sum(deviations * deviations, axis=1)
+        costs = np.empty((len(times), len(deviations)))
+        for k, at in enumerate(times):
+            gaps = ToolGaps(scene.at(float(at)), self.tool_spheres).gaps(targets[k] + deviations)
+            gap = gaps.min(axis=0, initial=np.inf)
+            lack = np.maximum(_WANTED + _GROWTH * (at - time) - gap, 0.0)
+            costs[k] = away + _NEAR_COST * lack * lack + np.where(gap < _TOUCHING, _TOUCH_COST * (1.0 + lack), 0.0)
+        chain = deviations[cheapest(costs, begin, self._cells)]
+        chain[0] = first
+        ahead = np.concatenate([np.repeat(chain[:1], 4, axis=0), chain])
+        smooth = gaussian_filter1d(ahead, _LOCAL_BLUR, axis=0, mode="nearest")[4:]
+        smooth += np.exp(-np.arange(len(smooth)))[:, None] * (first - smooth[0])  # begins where the tool is
+        return Trajectory(times, targets + smooth)
 
 
 def _clock(duration: float) -> Array:
@@ -296,4 +401,4 @@ def control(name: str, case: MovingCase, **options: Any) -> Policy:
     if name == "aims-at-obstacle":
         return AimsAtNearest.build(case.skill, **options)
     options.pop("pinned", None)
-    return Oracle(case, tracked=name == "oracle-tracks", **options)
+    return CausalOracle(case, **options) if name == "oracle-tracks" else Oracle(case, **options)

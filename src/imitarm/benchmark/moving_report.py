@@ -161,7 +161,7 @@ def recording_of(experiment: MovingExperiment, case: MovingCase, run: ToolRun) -
         tool.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=size, pos=[x, y, z], rgba=colour)
     model = spec.compile()
     data = mujoco.MjData(model)
-    observe = TrackedScene(case.truth, experiment.sensor, ObstacleTracker())
+    observe = TrackedScene(case.truth, experiment.sensor, ObstacleTracker("imm", rotations=True))
     recorder = FrameRecorder(model, rate=_RATE)
     for k in range(0, len(run.times), 4):
         time = float(run.times[k])

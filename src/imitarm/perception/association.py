@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from imitarm.perception.detection import Detection
 from imitarm.perception.motion_filter import Innovation, Measurements, inverse_3x3
+from imitarm.perception.rotation_rate import turned
+from imitarm.perception.tracks import UNCONFIRMED, Tracks
+from imitarm.scene.obstacle import Solid
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 _FORBIDDEN = 1e9  # cost of a pair outside the gate: worse than any number of pairs inside
 _ONES = np.ones(3)
+_OTHER_KIND, _MOST = 4.0, 9.0  # see unlikeness
+_SIZE, _ANGLE = 0.02, 0.4  # [m], [rad]
 _NONE = np.empty(0, dtype=np.intp)
 
 
@@ -48,8 +54,48 @@ class Pairs(NamedTuple):
 NO_PAIRS = Pairs(_NONE, _NONE, np.empty(0))
 
 
+def assigned(tracks: Tracks, detections: Sequence[Detection], measured: Measurements, gate: float) -> Pairs:
+    """Assign detections to tracks, each at most once; confirmed tracks choose first.
+
+    Args:
+        tracks: the tracks, predicted to the time of the detections.
+        detections: m detections.
+        measured: the same as measurements.
+        gate: largest normalised innovation squared, see :func:`assign`.
+    """
+    if not len(tracks) or not detections:
+        return NO_PAIRS
+    allowed = matching_labels(tracks.labels, [d.label for d in detections])
+    mean, covariance = tracks.moments
+    mean, covariance = mean[:, :3], covariance[:, :3, :3]
+    confirmed, pairs = tracks.ids != UNCONFIRMED, NO_PAIRS
+    free = np.ones(len(detections), dtype=bool)
+    groups = (confirmed,) if tracks.all_confirmed else (confirmed, ~confirmed)
+    for rows in (group.nonzero()[0] for group in groups):
+        columns = free.nonzero()[0]
+
+        def unlike(some: Indices, others: Indices, rows: Indices = rows, columns: Indices = columns) -> Array:
+            shapes = [tracks.detections[i].solid for i in rows[some].tolist()]
+            seen = [detections[i].solid for i in columns[others].tolist()]
+            return unlikeness(shapes, seen, tracks.sizes[rows[some]])
+
+        part = None if allowed is None else allowed[np.ix_(rows, columns)]
+        found = assign(mean[rows], covariance[rows], measured.rows(columns), gate, part, unlike)
+        if len(groups) == 1:
+            return found
+        found = Pairs(rows[found.tracks], columns[found.detections], found.distances)
+        free[found.detections] = False
+        pairs = pairs.joined(found)
+    return pairs.in_order()
+
+
 def assign(
-    positions: Array, covariances: Array, measured: Measurements, gate: float, allowed: NDArray[np.bool_] | None = None
+    positions: Array,
+    covariances: Array,
+    measured: Measurements,
+    gate: float,
+    allowed: NDArray[np.bool_] | None = None,
+    unlike: Callable[[Indices, Indices], Array] | None = None,
 ) -> Pairs:
     """Assign detections to tracks; each detection and each track is used at most once.
 
@@ -57,7 +103,8 @@ def assign(
     possible if the normalised innovation squared ``d^2 = nu' S^-1 nu`` is at most ``gate``, a quantile of the
     chi-square distribution with 3 degrees of freedom. The function considers only assignments with the largest possible
     number of pairs. Among these, it chooses the most probable assignment, which has the smallest sum of
-    ``d^2 + log det S``.
+    ``d^2 + log det S``. If ``unlike`` is given, it is added to the
+    sum.
 
     Args:
         positions: predicted positions of n tracks, shape (n, 3) [m].
@@ -65,6 +112,8 @@ def assign(
         measured: the m measured positions with their covariances.
         gate: largest ``d^2`` of a possible pair.
         allowed: whether each pair may be assigned, shape (n, m); None: every pair may.
+        unlike: function of the indices of k tracks and of k detections, which returns how much their shapes differ
+            (:func:`unlikeness`). It is called only if there is more than one possible assignment.
     """
     n, m = len(positions), len(measured.positions)
     if not n or not m:
@@ -81,7 +130,10 @@ def assign(
         innovation = innovation.rows(inside)
     if len(set(tracks.tolist())) == len(tracks) == len(set(detections.tolist())):
         return Pairs(tracks, detections, distance, innovation)  # no choice is left
-    return _best(tracks, detections, distance, np.log(innovation.determinant), (n, m))
+    cost = np.log(innovation.determinant)
+    if unlike is not None:
+        cost = cost + unlike(tracks, detections)
+    return _best(tracks, detections, distance, cost, (n, m))
 
 
 def _near(
@@ -102,6 +154,28 @@ def squared_distances(first: Array, second: Array) -> Array:
     offsets: Array = first.T[:, :, None] - second.T[:, None]
     offsets *= offsets
     return np.asarray(offsets[0] + offsets[1] + offsets[2])
+
+
+def unlikeness(first: Sequence[Solid], second: Sequence[Solid], sizes: Array) -> Array:
+    """Return how much the shapes of k tracks and k detections differ, shape (k,); 0 for equal ones, at most 9.
+
+    Two kinds of shape differ by 4, because a camera can take one shape for another. For equal kinds, the difference is
+    the sum of squares of normalised differences: of sizes, in units of 20 mm, and of rotations, in units of 0.4 rad.
+
+    Args:
+        first: shapes of the tracks, as last detected.
+        second: shapes of the detections.
+        sizes: smoothed sizes of the tracks, shape (k, 3) [m].
+    """
+    found = np.full(len(first), _OTHER_KIND)
+    same = [i for i, (a, b) in enumerate(zip(first, second, strict=True)) if a.kind == b.kind]
+    if same:
+        kinds = [first[i].kind for i in same]
+        before, now = (np.array([solids[i].quaternion for i in same]) for solids in (first, second))
+        angle = np.linalg.norm(turned(kinds, before, now), axis=1)
+        change = np.linalg.norm(sizes[same] - np.array([second[i].size for i in same]), axis=1)
+        found[same] = np.minimum((change / _SIZE) ** 2 + (angle / _ANGLE) ** 2, _MOST)
+    return found
 
 
 def _best(tracks: Indices, detections: Indices, distance: Array, log: Array, shape: tuple[int, int]) -> Pairs:

@@ -116,23 +116,18 @@ def resized(obstacle: Obstacle, size: Array) -> Obstacle:
     return replace(obstacle, **changes)
 
 
-def estimated(
-    obstacle: Obstacle, position: Array, velocity: Array, covariance: Array, track_id: int, name: str
-) -> Obstacle:
-    """Return a detected obstacle at its estimated position, with velocity, covariance, track number and name.
+def estimated(obstacle: Obstacle, covariance: Array, track_id: int, name: str) -> Obstacle:
+    """Return a placed obstacle with covariance, track number and name.
 
     The values are not checked.
 
     Args:
-        obstacle: detected obstacle; its rotation and size are kept, its angular velocity becomes 0.
-        position: estimated position of the local frame's origin, shape (3,) [m].
-        velocity: estimated velocity, shape (3,) [m/s].
+        obstacle: detected obstacle, placed at its estimated pose, with its velocities.
         covariance: covariance of the position, shape (3, 3) [m^2].
         track_id: number of the track.
         name: name of the returned obstacle.
     """
-    quaternion = obstacle.solid().quaternion
-    placed = copy.copy(obstacle.placed(position, quaternion, velocity, np.zeros(3)))
+    placed = copy.copy(obstacle)
     covariance = covariance.copy()
     covariance.setflags(write=False)
     for key, value in {"covariance": covariance, "track_id": track_id, "name": name}.items():

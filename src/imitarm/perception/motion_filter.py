@@ -27,7 +27,7 @@ DEFAULT_NOISE: dict[str, tuple[float, ...]] = {  # of each model; [m^2/s^3] for 
     "constant-velocity": (0.05,),
     "ekf": (0.05,),
     "constant-acceleration": (1.0,),
-    "imm": (0.02, 1.0),
+    "imm": (0.02, 30.0),
 }
 DWELL_TIME = 0.5  # [s] mean time for which an obstacle keeps one model of an IMM
 INITIAL_ACCELERATION = 2.0  # [m/s^2] standard deviation of each component of a new obstacle's acceleration

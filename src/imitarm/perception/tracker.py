@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import Pose
-from imitarm.perception.association import NO_PAIRS, Pairs, assign, duplicates, matching_labels
+from imitarm.perception.association import Pairs, assigned, duplicates
 from imitarm.perception.consistency import Consistency, chi_square_quantile
 from imitarm.perception.detection import Detection
 from imitarm.perception.motion_filter import Belief, Measurements, MotionFilter, updated
+from imitarm.perception.rotation_rate import Rates, turned, turned_on
 from imitarm.perception.tracks import UNCONFIRMED, TrackedObstacle, Tracks, smoothed_sizes
 from imitarm.scene import Obstacle, Scene
-from imitarm.validation import finite_number, sequence, whole_number
+from imitarm.validation import finite_number, instance, sequence, whole_number
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -70,8 +71,9 @@ class ObstacleTracker:
     **Consistency.** :attr:`consistency` compares the innovations with their covariance. If the mean is above the band,
     the detections are noisier than their covariance states, or ``process_noise`` is too small.
 
-    Rotations are not estimated: a track has the rotation of its last detection and no angular velocity. Sizes are
-    averaged over the detections.
+    **Rotation.** A track has the rotation of its last detection. With ``rotations``, its angular velocity is estimated
+    from the rotations of its detections (:class:`~imitarm.perception.rotation_rate.Rates`). Sizes are averaged over the
+    detections.
 
     Args:
         motion: model of the motion: ``"constant-velocity"``, ``"constant-acceleration"``, ``"imm"`` (both models,
@@ -79,7 +81,7 @@ class ObstacleTracker:
             measured in the coordinates of the camera (:attr:`Detection.camera_to_base`).
         process_noise: spectral density of the noise that disturbs the velocity [m^2/s^3] or, with constant
             acceleration, the acceleration [m^2/s^5]; two numbers for ``"imm"``. None: 0.05 for constant velocity, 1 for
-            constant acceleration, (0.02, 1) for ``"imm"``.
+            constant acceleration, (0.02, 30) for ``"imm"``.
         gate: probability that a detection of the tracked obstacle is within the gate.
         confirm: (hits, updates): a track is confirmed after this number of hits in its first updates; a hit is an
             update with a detection.
@@ -88,6 +90,8 @@ class ObstacleTracker:
         max_obstacles: largest number of tracks, and of detections in one update.
         initial_speed: standard deviation of each component of a new track's velocity [m/s].
         history: time for which late detections are accepted [s].
+        rotations: whether angular velocities are estimated; otherwise they are 0. Plans with a certificate replace a
+            rotating obstacle by a sphere around it.
 
     Raises:
         InputError: when an argument is out of its range.
@@ -105,6 +109,7 @@ class ObstacleTracker:
         max_obstacles: int = 32,
         initial_speed: float = 0.5,
         history: float = 0.5,
+        rotations: bool = False,
     ) -> None:
         self.motion = motion
         self.filter = MotionFilter(motion, process_noise, initial_speed)
@@ -117,6 +122,7 @@ class ObstacleTracker:
         self.max_speed = finite_number(max_speed, "ObstacleTracker: max_speed", "m/s", above=0.0)
         self.max_obstacles = whole_number(max_obstacles, "ObstacleTracker: max_obstacles", at_least=1)
         self.history = finite_number(history, "ObstacleTracker: history", "s", at_least=0.0)
+        self.rotations = instance(rotations, bool, "ObstacleTracker: rotations")
         self.reset()
 
     def reset(self) -> None:
@@ -208,7 +214,7 @@ class ObstacleTracker:
         packed = base.packed
         moved = packed.placed(
             mean[:, :3],
-            packed.quaternions,
+            turned_on(packed.quaternions, packed.angular_velocities, np.full(len(rows), time - tracks.stamp)),
             mean[:, 3:6],
             packed.angular_velocities,
             tracks.last_seen[rows],
@@ -269,7 +275,7 @@ class ObstacleTracker:
             if apart is not None:
                 detections, table = tuple([detections[i] for i in apart.tolist()]), table[apart]
                 measured = measured.rows(apart)
-            pairs = self._assigned(tracks, detections, measured)
+            pairs = assigned(tracks, detections, measured, self.gate)
             belief = self._corrected(tracks.belief, pairs, measured)
         else:
             belief, pairs = compiled
@@ -328,26 +334,6 @@ class ObstacleTracker:
         self.ignored["duplicate"] += len(dropped)
         return np.array([i for i in range(len(detections)) if i not in dropped])
 
-    def _assigned(self, tracks: Tracks, detections: tuple[Detection, ...], measured: Measurements) -> Pairs:
-        """Return the assignment; confirmed tracks choose first."""
-        if not len(tracks) or not detections:
-            return NO_PAIRS
-        allowed = matching_labels(tracks.labels, [d.label for d in detections])
-        mean, covariance = tracks.moments
-        mean, covariance = mean[:, :3], covariance[:, :3, :3]
-        if tracks.all_confirmed:
-            return assign(mean, covariance, measured, self.gate, allowed)
-        old, pairs = tracks.ids != UNCONFIRMED, NO_PAIRS
-        free = np.ones(len(detections), dtype=bool)
-        for rows in (old.nonzero()[0], (~old).nonzero()[0]):
-            columns = free.nonzero()[0]
-            part = None if allowed is None else allowed[np.ix_(rows, columns)]
-            found = assign(mean[rows], covariance[rows], measured.rows(columns), self.gate, part)
-            found = Pairs(rows[found.tracks], columns[found.detections], found.distances)
-            free[found.detections] = False
-            pairs = pairs.joined(found)
-        return pairs.in_order()
-
     def _corrected(self, belief: Belief, pairs: Pairs, measured: Measurements) -> Belief:
         """Return the beliefs after the assigned measurements."""
         rows = pairs.tracks
@@ -369,6 +355,7 @@ class ObstacleTracker:
         last_seen, counts = tracks.last_seen.copy(), tracks.counts.copy()
         last_seen[rows] = tracks.stamp
         seen, labels = list(tracks.detections), list(tracks.labels)
+        rates = self._turned(tracks, pairs, detections)
         for row, index in zip(rows.tolist(), columns.tolist(), strict=True):
             detection = detections[index]
             if detection.solid.kind != seen[row].solid.kind:
@@ -382,9 +369,21 @@ class ObstacleTracker:
             last_seen=last_seen,
             sizes=smoothed_sizes(tracks.sizes, rows, sizes[columns], counts),
             counts=counts,
+            rates=rates,
             detections=tuple(seen),
             labels=tuple(labels),
         )
+
+    def _turned(self, tracks: Tracks, pairs: Pairs, detections: tuple[Detection, ...]) -> Rates:
+        """Return the angular velocities after the assigned detections."""
+        rows = pairs.tracks
+        if not self.rotations:
+            return tracks.rates
+        before = [tracks.detections[i].solid for i in rows.tolist()]
+        now = [detections[i].solid for i in pairs.detections.tolist()]
+        kinds = [b.kind if a.kind == b.kind else "sphere" for a, b in zip(before, now, strict=True)]
+        turns = turned(kinds, np.array([a.quaternion for a in before]), np.array([b.quaternion for b in now]))
+        return tracks.rates.seen(rows, turns, tracks.stamp - tracks.last_seen[rows])
 
     def _cap(self, mean: Array) -> None:
         """Scale down speeds above ``max_speed`` in the states (..., m)."""
@@ -417,6 +416,7 @@ class ObstacleTracker:
             ages=ones,
             sizes=np.array([d.solid.size for d in detections], dtype=float).reshape(k, 3),
             counts=ones,
+            rates=Rates.none(k),
             detections=tuple(detections),
             labels=tuple(d.label for d in detections),
         )

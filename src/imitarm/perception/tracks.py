@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from imitarm.html_table import html_table
 from imitarm.perception.detection import Detection, estimated, resized
 from imitarm.perception.motion_filter import Belief, MotionFilter
+from imitarm.perception.rotation_rate import Rates, turned_on
 from imitarm.scene import Obstacle
 from imitarm.validation import finite_number
 
@@ -35,6 +36,7 @@ class Tracks:
         ages: number of updates since the track began, shape (n,).
         sizes: size of each shape, averaged over detections, shape (n, 3) [m].
         counts: number of detections over which each size is averaged, shape (n,).
+        rates: angular velocity of each obstacle, with its scatter.
         detections: last detection of each track, n entries.
         labels: last label of each track that was not empty, n entries.
         next_id: number of the next track that is confirmed.
@@ -49,6 +51,7 @@ class Tracks:
     ages: NDArray[np.int64]
     sizes: Array
     counts: NDArray[np.int64]
+    rates: Rates
     detections: tuple[Detection, ...]
     labels: tuple[str, ...]
     next_id: int = 0
@@ -66,7 +69,9 @@ class Tracks:
         whole = np.zeros(0, dtype=np.int64)
         belief = motion_filter.born(np.zeros((0, 3)), np.zeros((0, 3, 3)))
         sizes = np.zeros((0, 3))
-        return cls(motion_filter, stamp, belief, whole, np.zeros(0), whole, whole, sizes, whole, (), (), next_id)
+        return cls(
+            motion_filter, stamp, belief, whole, np.zeros(0), whole, whole, sizes, whole, Rates.none(0), (), (), next_id
+        )
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -87,6 +92,7 @@ class Tracks:
             ages=self.ages[rows],
             sizes=self.sizes[rows],
             counts=self.counts[rows],
+            rates=self.rates.rows(rows),
             detections=tuple(self.detections[i] for i in chosen),
             labels=tuple(self.labels[i] for i in chosen),
         )
@@ -101,6 +107,7 @@ class Tracks:
             ages=np.concatenate([self.ages, other.ages]),
             sizes=np.concatenate([self.sizes, other.sizes]),
             counts=np.concatenate([self.counts, other.counts]),
+            rates=self.rates.joined(other.rates),
             detections=self.detections + other.detections,
             labels=self.labels + other.labels,
         )
@@ -113,6 +120,11 @@ class Tracks:
     def moments(self) -> tuple[Array, Array]:
         """Mean (n, m) and covariance (n, m, m) of each obstacle's state, combined over all models of motion."""
         return self.belief.combined()
+
+    @cached_property
+    def reported_rates(self) -> Array:
+        """Angular velocity of each obstacle, reduced by its uncertainty, shape (n, 3) [rad/s]."""
+        return self.rates.reported
 
     @cached_property
     def all_confirmed(self) -> bool:
@@ -171,6 +183,11 @@ class TrackedObstacle:
         return self.tracks.moments[0][self.row, 3:6]
 
     @property
+    def angular_velocity(self) -> Array:
+        """Estimated angular velocity, shape (3,) [rad/s]; 0 unless it is larger than its noise."""
+        return self.tracks.reported_rates[self.row]
+
+    @property
     def covariance(self) -> Array:
         """Covariance of position and velocity, shape (6, 6) [m^2, m^2/s, m^2/s^2]."""
         return self.tracks.moments[1][self.row, :6, :6]
@@ -179,8 +196,8 @@ class TrackedObstacle:
     def obstacle(self) -> Obstacle:
         """The obstacle at ``stamp``, with velocity, covariance of the position, track number and name.
 
-        The size is averaged over the detections. Rotations are not estimated: the rotation is taken from the last
-        detection, and the angular velocity is 0.
+        The size is averaged over the detections. The rotation is that of the last detection, rotated on since then with
+        the estimated angular velocity.
         """
         tracks, row = self.tracks, self.row
         shape = tracks.detections[row].obstacle
@@ -189,7 +206,10 @@ class TrackedObstacle:
         name = shape.name or self.label or f"track {self.track_id}"
         covariance = self.covariance[:3, :3]
         covariance = 0.5 * (covariance + covariance.T)
-        return estimated(shape, self.position, self.velocity, covariance, self.track_id, name)
+        rates, elapsed = self.angular_velocity[None], np.array([tracks.stamp - self.last_seen])
+        quaternion = turned_on(shape.solid().quaternion[None], rates, elapsed)[0]
+        moved = shape.placed(self.position, quaternion, self.velocity, rates[0])
+        return estimated(moved, covariance, self.track_id, name)
 
     def predict(self, horizon: float) -> TrackedObstacle:
         """Return the obstacle ``horizon`` seconds later, without new detections; its uncertainty grows.

@@ -202,6 +202,7 @@ class LeastCost:
         obstacle_cost: b, the cost of being near an obstacle.
         max_acceleration: a_max, the largest coupling acceleration [m/s^2].
         units: headings in the frame of :func:`frame`, shape (k, d).
+        limit: largest acceleration of the deviation by u, spring and damper together [m/s^2].
         discount: gamma, the factor by which the weight decreases from one instant to the next.
         deviation_weight: w_e, weight of the deviation [1/m^2].
         change_weight: w_Delta, weight of a change of u since the last step.
@@ -217,6 +218,7 @@ class LeastCost:
     obstacle_cost: ObstacleCost
     max_acceleration: float
     units: Array
+    limit: float = math.inf
     discount: float = 0.93
     deviation_weight: float = 16.0
     change_weight: float = 0.02
@@ -293,8 +295,12 @@ class LeastCost:
         precision: Array,
         predict: Callable[[Array], Prediction],
         obstacles: PredictedObstacles,
+        pull: Array | None = None,
     ) -> Choice:
         """Return the candidate of least cost.
+
+        A candidate that would accelerate the deviation by more than ``limit`` is moved towards ``pull``, until it does
+        not.
 
         Args:
             axes: frame of the motion, shape (3, d).
@@ -304,9 +310,13 @@ class LeastCost:
             precision: Theta at the current phase, shape (3, 3).
             predict: function that takes speeds of the phase (R,) and returns the motion without coupling.
             obstacles: the obstacles that may come near.
+            pull: acceleration ``(D e' / tau + K e / tau^2)`` of spring and damper, against the deviation, shape (3,)
+                [m/s^2]; None: without limit.
         """
         scaled, sizes = self._candidates
         scaled = scaled @ axes.T
+        if pull is not None:
+            scaled, sizes = self._feasible(scaled, sizes, pull / self.max_acceleration)
         if len(one_sided):
             allowed = (scaled @ one_sided.T <= 1e-9).all(axis=1)
             scaled, sizes = scaled[allowed], sizes[allowed]
@@ -324,6 +334,17 @@ class LeastCost:
                 best = Choice(scaled[index], self.rates[begin + rate], cost, nearest, gap)
         assert best is not None
         return best
+
+    def _feasible(self, scaled: Array, sizes: Array, pull: Array) -> tuple[Array, Array]:
+        """Return candidates whose acceleration, less that of spring and damper, keeps the limit; the first one is 0."""
+        change = scaled - pull
+        factor = self.limit / self.max_acceleration / np.sqrt(np.maximum(np.sum(change * change, axis=1), 1e-12))
+        factor[0] = 1.0
+        if factor.min() >= 1.0:
+            return scaled, sizes
+        scaled = np.where((factor < 1.0)[:, None], pull + factor[:, None] * change, scaled)
+        scaled = scaled / np.maximum(np.sqrt(np.sum(scaled * scaled, axis=1)), 1.0)[:, None]
+        return scaled, (self.size_weight + self.change_weight) * np.sum(scaled * scaled, axis=1)
 
     def _best(
         self, scaled: Array, smooth: Array, prediction: Prediction, obstacles: PredictedObstacles, bound: float

@@ -76,7 +76,8 @@ class RCAMO(Policy):
         beta: see ``margin``.
         cap: see ``margin`` [m].
         time_constant: tau, the time constant of the deviation [s]; the thesis uses 1 s.
-        max_acceleration: largest u [m/s^2]. A constant u leads to the deviation ``tau^2 u / K``.
+        max_acceleration: largest acceleration of the deviation by u, spring and damper together [m/s^2].
+        max_push: largest u [m/s^2]. A constant u leads to the deviation ``tau^2 u / K``.
         horizon: number H of predicted instants.
         interval: time between two predicted instants [s].
         gain: feedback gain of the tool's position and rotation [1/s].
@@ -96,6 +97,7 @@ class RCAMO(Policy):
         cap: float = 0.01,
         time_constant: float = 2.0,
         max_acceleration: float = 10.0,
+        max_push: float = 20.0,
         horizon: int = 12,
         interval: float = 0.05,
         gain: float = 8.0,
@@ -116,6 +118,7 @@ class RCAMO(Policy):
         steps = whole_number(horizon, "RCAMO: horizon", at_least=1, at_most=200)
         times = finite_number(interval, "RCAMO: interval", "s", above=0.0) * np.arange(1.0, steps + 1.0)
         limit = finite_number(max_acceleration, "RCAMO: max_acceleration", "m/s^2", above=0.0)
+        push = finite_number(max_push, "RCAMO: max_push", "m/s^2", above=0.0)
         spheres = np.zeros((1, 4)) if self.tool_spheres is None else self.tool_spheres
         self._spheres = spheres[:, :3]
         self._offset_spheres = bool(self._spheres.any())
@@ -127,7 +130,9 @@ class RCAMO(Policy):
         if cost == "gaussian":
             whole = LeastCost.deviation_weight * float(np.sum(LeastCost.discount ** np.arange(1.0, steps + 1.0)))
             obstacle_cost = GaussianCost(self.clearance, spheres[:, 3], stiffness=whole)
-        self.least_cost = LeastCost(times, self.gains, self._tau, obstacle_cost, limit, headings(self._axes))
+        self.least_cost = LeastCost(
+            times, self.gains, self._tau, obstacle_cost, push, headings(self._axes), limit=limit
+        )
         self._dmp, self._precision = _primitive(skill, self.gains), learned_precision(skill)
         self._steps: dict[float, Response] = {}
         self._path: PrimitivePath | None = None
@@ -253,7 +258,9 @@ class RCAMO(Policy):
             return Prediction(centers, phases >= 1.0, goal)
 
         axes = frame(path.tangent(self._phase), self._axes)
-        chosen = least_cost.choose(axes, self._one_sided, self._scaled, free, precision, predict, near.obstacles)
+        e, v = self._deviation
+        pull = (self.gains.stiffness / self._tau**2) * e + (self.gains.damping / self._tau) * v
+        chosen = least_cost.choose(axes, self._one_sided, self._scaled, free, precision, predict, near.obstacles, pull)
         self._scaled = chosen.scaled
         return chosen
 

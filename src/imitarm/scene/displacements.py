@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.scene.distances import Members, PackedObstacles, every, take
+from imitarm.kinematics.pose import quaternion_exp, quaternion_multiply, quaternion_to_matrix
+from imitarm.scene.distances import KINDS, Members, PackedObstacles, every, take
+from imitarm.scene.edged import DEPTH
 from imitarm.scene.rounded import ROUNDS
 
 Array = NDArray[np.float64]
@@ -31,56 +33,51 @@ def displaced_distances(
     Returns:
         Shape (k, m) [m], negative inside.
     """
-    if not packed.rotating:
-        return _displaced_by_family(packed, members, times, origins, scales, directions)
-    distance = np.empty((len(members), len(directions)))
-    for time in np.unique(times).tolist():
-        now = (times == time).nonzero()[0]
-        given = members[now], np.zeros(len(now)), origins[now], scales[now], directions
-        distance[now] = _displaced_by_family(packed.after(time), *given)
-    return distance
-
-
-def _displaced_by_family(
-    packed: PackedObstacles, members: Indices, times: Array, origins: Array, scales: Array, directions: Array
-) -> Array:
-    """Return :func:`displaced_distances` for obstacles that keep their rotation."""
     families, place = packed._sorted[1], packed._place_of[members]
+    to_local, q = _local(packed, members, place, times, origins)
     if len(families) == 1:
-        return _displaced(packed, families[0], place, times, origins, scales, directions)
+        return _displaced(families[0], place, to_local, q, scales, directions)
     distance = np.empty((len(members), len(directions)))
     for family in families:
         rows = ((place >= family.places.start) & (place < family.places.stop)).nonzero()[0]
         if len(rows):
-            given = place[rows], times[rows], origins[rows], scales[rows], directions
-            distance[rows] = _displaced(packed, family, *given)
+            turned = None if to_local is None else to_local[rows]
+            distance[rows] = _displaced(family, place[rows], turned, q[:, rows], scales[rows], directions)
     return distance
 
 
-def _displaced(
-    packed: PackedObstacles,
-    family: Members,
-    place: Indices,
-    times: Array,
-    origins: Array,
-    scales: Array,
-    directions: Array,
-) -> Array:
-    """Return :func:`displaced_distances` for groups of one family; ``place`` is in the order of ``_sorted``."""
-    frames, m = packed._frames, len(directions)
+def _local(
+    packed: PackedObstacles, members: Indices, place: Indices, times: Array, origins: Array
+) -> tuple[Array | None, Array]:
+    """Return the rotation into the local frame of each group (k, 3, 3), None for upright ones, and origins (3, k)."""
+    frames = packed._frames
+    if packed.rotating:
+        steps = quaternion_exp(times[:, None] * packed.angular_velocities[members])
+        rotations = quaternion_to_matrix(quaternion_multiply(steps, packed.quaternions[members]))
+        to_local = rotations.swapaxes(1, 2)
+        away = origins - packed.positions[members] - times[:, None] * packed.velocities[members]
+        q = np.matmul(to_local, away[:, :, None])[..., 0].T
+        q[2, packed.kinds[members] == KINDS.index("half_space")] += DEPTH
+        return to_local, q
     center = frames.center[:, place, 0] + frames.velocity[:, place, 0] * times
-    parameters = take(family.parameters, place - family.places.start)
     if frames.upright:
-        q = origins.T - center
-    else:
-        q = np.matmul(frames.to_local[place], origins[:, :, None])[..., 0].T - center
+        return None, origins.T - center
+    to_local = frames.to_local[place]
+    return to_local, np.matmul(to_local, origins[:, :, None])[..., 0].T - center
+
+
+def _displaced(
+    family: Members, place: Indices, to_local: Array | None, q: Array, scales: Array, directions: Array
+) -> Array:
+    """Return :func:`displaced_distances` for groups of one family, whose origins are ``q`` (3, k) in local frames."""
+    m, parameters = len(directions), take(family.parameters, place - family.places.start)
     if family.formula is ROUNDS.formula and parameters[1] is None and parameters[0] is not None:
-        turned_back = q.T if frames.upright else np.matmul(q.T[:, None], frames.to_local[place])[:, 0]
+        turned_back = q.T if to_local is None else np.matmul(q.T[:, None], to_local)[:, 0]
         return _displaced_from_spheres(parameters[0], turned_back, scales, directions)
-    if frames.upright:
+    if to_local is None:
         points = q[:, :, None] + scales[:, None] * directions.T[:, None]
     else:
-        turned = np.matmul(directions, frames.to_local[place].swapaxes(1, 2)).transpose(2, 0, 1)
+        turned = np.matmul(directions, to_local.swapaxes(1, 2)).transpose(2, 0, 1)
         points = q[:, :, None] + scales[:, None] * turned
     return family.formula(np.ascontiguousarray(points), False, *every(parameters))[0].reshape(-1, m)
 
