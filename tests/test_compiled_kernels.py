@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import runpy
 import shutil
 
 import numpy as np
 import pytest
 
+import imitarm.compiled.__main__
 from compiled_code import compiled, library_at  # noqa: F401  a fixture
 from imitarm.compiled import build, kernels, library
 from imitarm.compiled.kernels import Record, address
@@ -66,3 +68,11 @@ def test_a_record_has_the_layout_of_a_structure():
     assert (five, place) == (5, address(numbers))
     assert record._lists[0].tolist() == [inner.address, 0]
     assert places == address(record._lists[0])
+
+
+def test_the_program_builds_only_when_it_is_run(monkeypatch, capsys):
+    monkeypatch.setattr(kernels, "build", lambda: "built it")
+    runpy.run_path(imitarm.compiled.__main__.__file__, run_name="imported")
+    assert capsys.readouterr().out == ""
+    runpy.run_path(imitarm.compiled.__main__.__file__, run_name="__main__")
+    assert capsys.readouterr().out == "built it\n"
