@@ -129,7 +129,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     other.set_defaults(benchmark=_avoidance)
     third = parsers.add_parser(
         "refusals",
-        help="check whether paths and refusals are correct, by an independent search (oracle) in random scenes",
+        help="check by an independent search (oracle) that planned paths are clear, and that no path was overlooked",
     )
     third.add_argument("--scenes", type=int, default=1000, metavar="N", help="how many; default: 1000")
     third.add_argument("--first", type=int, default=0, metavar="N", help="first seed; default: 0")
@@ -189,7 +189,7 @@ def _add_placements(parsers: Any) -> None:
     placed.set_defaults(benchmark=_placements)
     compared = parsers.add_parser(
         "comparison",
-        help="compare a policy with the other policies, in saved results in which the other policy reached the goal",
+        help="from saved results, compare a policy with each other policy in placements that the other policy solved",
     )
     compared.add_argument(
         "results", type=Path, nargs="+", metavar="RESULTS", help="files that 'placements --out' wrote"

@@ -94,7 +94,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     Raises:
         InputError: when an option, a file or the source is invalid.
-        TaskFailedError: when no robot answers, or the robot can no longer be controlled or never followed a person.
+        TaskFailedError: when no robot answers, when the robot can no longer be controlled, or when it never followed a
+            person.
     """
     _check_options(arguments)
     correspondence = _correspondence(arguments)

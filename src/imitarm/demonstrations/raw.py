@@ -222,9 +222,9 @@ class RawDemonstration:
         """Return for each row whether the sensor had no new value yet, so that the row repeats the previous row.
 
         A recorder that runs faster than its sensor repeats each value (sample and hold). A tool at rest also repeats
-        values, and so does rounding. Repetitions caused by rest or rounding do not count. Values count as held only if
-        they are repeated many times during the motion, and if their changes are larger than rounding to the last digit
-        would cause. The result has the shape (n,).
+        values, and rounding can make different values equal. Repetitions caused by rest or rounding do not count.
+        Values count as held only if they are repeated many times during the motion, and if their changes are larger
+        than rounding to the last digit would cause. The result has the shape (n,).
         """
         masks = [held_rows(part) for part in (self.positions, self.quaternions, self.joints) if part is not None]
         return max(masks, key=lambda mask: int(mask.sum()), default=np.zeros(len(self), dtype=bool))

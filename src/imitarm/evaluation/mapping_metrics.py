@@ -79,10 +79,10 @@ class MappingMetrics:
         gravity_effort: like ``effort``, but only for the torques that hold the arm against gravity [N^2 m^2 s].
         peak_torque_ratio: largest torque of a joint, divided by the joint's rated torque.
         position_violations: number of frames in which a joint is outside its range.
-        velocity_violations: number of frames in which a joint exceeds its velocity limit, by finite differences of the
-            positions.
-        acceleration_violations: number of frames in which a joint exceeds its acceleration limit, by finite differences
-            of the positions.
+        velocity_violations: number of frames in which a joint exceeds its velocity limit; the velocity is the finite
+            difference of the positions.
+        acceleration_violations: number of frames in which a joint exceeds its acceleration limit; the acceleration is
+            the second finite difference of the positions.
         position_excess: largest distance of a joint from its range [rad].
         velocity_ratio: largest velocity of a joint, divided by the joint's limit.
         acceleration_ratio: largest acceleration of a joint, divided by the joint's limit.

@@ -213,9 +213,9 @@ def rms(errors: ArrayLike) -> float:
 def best_lag(true: TrueArm, tool: Array, periods: EngagementPeriods, scale: float) -> tuple[float, float]:
     """Return the constant lag that explains the tool's motion best [s], and the RMS error after removing this lag [m].
 
-    Lags from -0.1 to 0.8 s are tried. A parabola is fitted to the errors of the lag with the smallest error and of its
-    two neighbours. The best lag is the minimum of this parabola. The lag and the error are nan if no frame is engaged.
-    The lag is also nan if the hand did not move.
+    Lags from -0.1 to 0.8 s are tried. A parabola is fitted to the smallest error and the errors of the two neighbouring
+    lags. The best lag is the minimum of this parabola. The lag and the error are nan if no frame is engaged. The lag is
+    also nan if the hand did not move.
     """
     engaged = periods.engaged
     if not engaged.any():
