@@ -101,7 +101,7 @@ def inverse_hessian(cost: PathCost, weights: Array, blocks: Array) -> Array:
 
 
 def expectation(cost: PathCost, weights: Array, start: Array) -> Expectation:
-    """Search a minimum of the cost from ``start`` (94, k) [m]; return Laplace's mean and covariance of the features."""
+    """Search for a minimum of the cost from ``start`` (94, k); return Laplace's mean and covariance of the features."""
     minimum = cost.minimised(weights, start)
     blocks = cost.blocks(minimum)
     inverse = inverse_hessian(cost, weights, blocks)
