@@ -28,7 +28,7 @@ BEFORE = {
         "imitarm capture synthetic:7 --seconds 20 --out wave.csv",
         "imitarm calibrate limbs wave.csv",
         "imitarm calibrate sensor pairs.csv",
-        "imitarm calibrate clutch --robot panda --orientation upright",
+        "imitarm calibrate clutch --robot panda --anchor shoulder --orientation upright",
         *(
             f"imitarm capture synthetic:{i} --seconds 12 --out person_{i}.csv && imitarm retarget person_{i}.csv "
             f"--tool gripper --fit --out wave_{i}.csv"
