@@ -30,7 +30,7 @@ BEFORE = {
         "imitarm calibrate sensor pairs.csv",
         "imitarm calibrate clutch --robot panda --anchor shoulder --orientation upright",
         *(
-            f"imitarm capture synthetic:{i} --seconds 12 --out person_{i}.csv && imitarm retarget person_{i}.csv "
+            f"imitarm capture synthetic:7 --seconds 12 --out person_{i}.csv && imitarm retarget person_{i}.csv "
             f"--tool gripper --fit --out wave_{i}.csv"
             for i in (1, 2, 3)
         ),
