@@ -35,6 +35,7 @@ Array = NDArray[np.float64]
 ROBOTS = {"sawyer": "brush", "panda": "gripper"}
 """Name of each arm, and the name of the tool that it holds."""
 _SPARE = 0.01  # [m] beyond the required clearance, at the start and at the goal
+_INTERVAL = 0.05  # [s] between the instants at which the base is checked
 _STILL = 0.05  # [rad/s] joints slower than this stand
 
 
@@ -51,8 +52,9 @@ def prepared(robot: str) -> tuple[Skill, ArmModel, Array]:
 def arm_case(robot: str, family: str, seed: int) -> MovingCase:
     """Return a scene around the path of the skill 'sweep'.
 
-    No obstacle overlaps the arm at the start, or its tool at the goal. If the scene of a seed breaks this rule, the
-    seed is replaced by a seed that is 10 000 larger.
+    No obstacle overlaps the arm at the start, or its tool at the goal. No obstacle comes near the fixed base of the arm
+    during the run, because the base can't evade. If the scene of a seed breaks these rules, the seed is replaced by a
+    seed that is 10 000 larger.
 
     Raises:
         InputError: when no scene is found.
@@ -65,9 +67,20 @@ def arm_case(robot: str, family: str, seed: int) -> MovingCase:
         case = moving_case(family, 3, number, skill=skill)
         early = _least_gap(case, np.linspace(-0.5, 0.3, 9), centers, radii)
         late = _least_gap(case, skill.duration_ * np.linspace(1.0, LONGEST, 15), tool, arm.tool_spheres[:, 3])
-        if min(early, late) > case.clearance + _SPARE:
+        if min(early, late) > case.clearance + _SPARE and _leaves_base_free(case, arm):
             return case
     raise InputError(f"{family}, seed {seed}: no scene leaves the {robot} free at the start")
+
+
+def _leaves_base_free(case: MovingCase, arm: ArmModel) -> bool:
+    """Return whether no obstacle comes near the fixed base of the arm, from before the start to the end of the run."""
+    times = np.arange(-0.5, LATEST * case.skill.duration_, _INTERVAL)
+    base, radii, reach = arm.cover.base_centers, arm.cover.base_radii, case.truth.scene.packed.radii
+    obstacles = np.array([case.truth.poses(float(time))[0] for time in times])
+    middle = base.mean(axis=0)
+    size = float((np.linalg.norm(base - middle, axis=1) + radii).max())
+    near = (np.linalg.norm(obstacles - middle, axis=2) - reach < size + case.clearance).any(axis=1)
+    return not near.any() or _least_gap(case, times[near], base, radii) > case.clearance
 
 
 def _least_gap(case: MovingCase, times: Array, centers: Array, radii: Array) -> float:
