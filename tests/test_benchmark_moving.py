@@ -11,6 +11,7 @@ import pytest
 
 from imitarm import cli
 from imitarm.benchmark.moving import OURS, MovingExperiment, build, default_methods, method_names
+from imitarm.benchmark.moving_arm import arm_case, prepared
 from imitarm.benchmark.moving_controls import Grid, cells, cheapest, search
 from imitarm.benchmark.moving_measures import Contact, contacts, limits_kept, measured, tracking
 from imitarm.benchmark.moving_motions import AWAY, appearing, stop_and_go, turning, weaving
@@ -18,7 +19,7 @@ from imitarm.benchmark.moving_results import RESULTS, MovingResults
 from imitarm.benchmark.moving_scenes import FAMILIES, FASTEST, LONGEST, MovingCase, distances_in_time, moving_case
 from imitarm.benchmark.moving_tables import moving_tables
 from imitarm.benchmark.moving_world import DT, Seen, ToolRun, run_tool, within_limits
-from imitarm.benchmark.static_measures import MAX_ACCELERATION, MAX_SPEED
+from imitarm.benchmark.static_measures import LATEST, MAX_ACCELERATION, MAX_SPEED
 from imitarm.benchmark.static_scenes import learned_skill
 from imitarm.benchmark.tables import END
 from imitarm.command import Status
@@ -327,6 +328,17 @@ def test_a_whole_arm_moves_among_the_same_obstacles():
     )
     tables = moving_tables(MovingResults([result]))
     assert tables and all(table.title.startswith("sawyer: ") for table in tables)
+
+
+def test_no_obstacle_passes_through_the_base_of_an_arm():
+    arm = prepared("sawyer")[1]
+    base, radii = arm.cover.base_centers, arm.cover.base_radii
+    for seed in range(1000, 1010):
+        case = arm_case("sawyer", "M7", seed)
+        times = np.arange(0.0, LATEST * case.skill.duration_, 0.02)
+        for centre, radius in zip(base, radii, strict=True):
+            gap = distances_in_time(case.truth, times, np.tile(centre, (len(times), 1))) - radius
+            assert gap.min() > 0.9 * case.clearance, seed
 
 
 def test_worlds_are_checked():

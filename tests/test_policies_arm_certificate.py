@@ -167,3 +167,14 @@ def test_near_pairs_are_all_pairs_that_are_near_however_fast_the_arm_moves(name)
             centers = path.centers - times[:, None, None] * obstacle.velocity
             room = obstacle.signed_distance(centers) - arm.cover.radii - 0.02
             assert (room < 0.05).sum() == (together.obstacle == i).sum()
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_the_same_postures_at_several_times_have_the_clearances_of_each_time(name):
+    arm, own = ARMS[name], OWN[name]
+    for seed in range(8):
+        path, times, obstacles = random_scene(arm, seed)
+        around = ArmAmongObstacles(arm, obstacles, 0.02, own=own)
+        clocks = times + np.array([0.0, 0.3, 2.0])[:, None]
+        expected = [around.clearance_at(path, clock, 0.0).room for clock in clocks]
+        np.testing.assert_allclose(around.rooms_at(path.joints, clocks), expected, atol=1e-6)

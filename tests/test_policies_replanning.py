@@ -244,3 +244,27 @@ def test_a_link_at_an_obstacle_at_a_pinned_time_moves_away_by_self_motion_or_the
     i = int(np.argmin(np.abs(plan.nominal.times - pin)))
     np.testing.assert_allclose(plan.trajectory.positions[i], plan.nominal.positions[i], atol=1e-5)
     assert clearance_of(arm, Scene(None, [post]), plan) >= 0.02 - 1e-6
+
+
+@each_arm
+def test_a_limited_search_ends_early_and_goes_on_in_the_next_one(name):
+    _, arm, _ = carrying(name)
+    scene, plan = planned(name)
+    state, ball = on_the_way(arm, plan, 1.0), scene.obstacles[0]
+    nearer = Scene(None, [replace(ball, center=ball.center + 0.035 * towards(arm, ball, plan))])
+    options = {**OPTIONS, "arm": arm, "state": state, "phase": 1.0, "max_attempts": 1}
+    assert replan(plan, nearer, **options).feasible
+    found = replan(plan, nearer, max_rounds=1, **options)
+    assert not found.feasible
+    for _ in range(12):
+        guess = found.displacement
+        found = replan(plan, nearer, max_rounds=3, displacement=guess, **options)
+        if found.feasible:
+            break
+    assert found.feasible, found.reason
+    assert clearance_of(arm, nearer, found) >= 0.02 - 1e-6
+    for wrong in (np.zeros(3), np.full_like(plan.displacement, np.nan)):
+        with pytest.raises(InputError, match="displacement"):
+            replan(plan, nearer, displacement=wrong, **options)
+    with pytest.raises(InputError, match="max_rounds"):
+        replan(plan, nearer, max_rounds=0, **options)

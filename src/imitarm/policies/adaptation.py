@@ -296,7 +296,8 @@ def of_whole_arm(
     """
     plan, timing, spent = solution.plan, solution.timing, time.perf_counter() - began
     if plan is None or not plan.complete:
-        return replace(tool, feasible=False, reason=solution.reason, compute_time=spent)
+        moved = tool.displacement if plan is None else plan.displacement
+        return replace(tool, displacement=moved, feasible=False, reason=solution.reason, compute_time=spent)
     used = plan.components
     times = tool.nominal.times if timing is None else timing.times
     jerk = used.jerk_ratio(plan.path.positions)

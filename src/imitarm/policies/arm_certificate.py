@@ -175,6 +175,25 @@ class ArmAmongObstacles:
         """
         return lowest_of(self.gaps(path, times, reach), reach)
 
+    def rooms_at(self, joints: Array, clocks: Array) -> Array:
+        """Return the smallest clearance of the same postures for each of m clocks, at most 0, shape (m,) [m].
+
+        Args:
+            joints: unrelated postures, shape (n, n_joints) [rad].
+            clocks: times of the postures, shape (m, n) [s].
+        """
+        (m, n), lowest = clocks.shape, np.zeros(len(clocks))
+        once, often = ArmPath.of(self.arm, joints), ArmPath.of(self.arm, np.tile(joints, (m, 1)))
+        for pairs in self._pairs:
+            moves = pairs.margin is not None or bool(np.any(pairs.velocity))
+            path, times = (often, clocks.ravel()) if moves else (once, clocks[0])
+            sample, _, room = pairs.near(path, times, np.zeros((len(path), pairs.n_groups)), None)
+            if moves:
+                np.minimum.at(lowest, sample // n, room)
+            else:
+                lowest = np.minimum(lowest, room.min(initial=0.0))
+        return lowest
+
     def clearance_of(self, path: ArmPath, times: Array) -> ArmClearance:
         """Bound the clearance on a whole joint path, on which the joints move linearly between the samples.
 

@@ -39,6 +39,7 @@ _STRIDE = 4  # the rounds look at every fourth sample, the last ones at all
 _ROUNDS = 24
 _FINAL_ROUNDS = 10  # with all samples
 _QUICK_ROUNDS = 8, 4  # of both, when the time is limited
+_ALL_SAMPLES = 2.0  # rounds that a round with all samples counts as
 _PATIENCE, _LESS_PATIENCE = 7, 3  # rounds without progress, then this attempt is given up: usually, and far from clear
 _FAR = 0.02  # [m] an attempt that lacks more is far from clear
 _PROGRESS, _NEARLY = 1e-3, 0.2  # progress that counts: of the smallest distance [m], or as a fraction of what it lacks
@@ -60,6 +61,22 @@ _ACCURATE = 1e-5  # [m, rad] error of the tool's pose that is accepted
 _GRID = np.array(list(product((-1.0, 0.0, 1.0), repeat=3)))
 _FACETS = _GRID[_GRID.any(axis=1)] / np.linalg.norm(_GRID[_GRID.any(axis=1)], axis=1, keepdims=True)  # 26 directions
 _AXES = np.abs(_FACETS).max(axis=1) == 1.0  # which of them are along an axis
+
+
+@dataclass
+class Effort:
+    """How many rounds of a search are left, so that a plan does not take too long.
+
+    A round improves a joint path once. The limit is a number of rounds, and no time, so that the result does not depend
+    on the computer.
+    """
+
+    left: float
+
+    def spend(self, rounds: float = 1.0) -> bool:
+        """Use up some rounds; return whether they were left."""
+        self.left -= rounds
+        return self.left >= 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +129,7 @@ class ArmPlanner:
         begun: whether the motion has begun; if so, the self-motion must not change the velocity at the start.
         spare: additional clearance that the planner aims at but does not require [m].
         quick: whether to give up after fewer rounds.
+        effort: rounds that are left in the whole search; None: no limit.
 
     Attributes:
         coarse: indices of the few samples that are planned first, shape (k,); all samples are planned afterwards.
@@ -133,6 +151,7 @@ class ArmPlanner:
         begun: bool = False,
         spare: float = 0.0,
         quick: bool = False,
+        effort: Effort | None = None,
     ) -> None:
         self.around, self.arm, self.components, self.free_start, self.begun = (
             around,
@@ -144,6 +163,7 @@ class ArmPlanner:
         self.quaternions, self.max_tilt, self.allowed = quaternions, max_tilt, allowed
         self.spare, self.times = spare, components.nominal.times
         self._rounds = _QUICK_ROUNDS if quick else (_ROUNDS, _FINAL_ROUNDS)
+        self._effort = Effort(np.inf) if effort is None else effort
         self.clock = self.times
         n = len(self.times)
         self.coarse = np.unique(np.append(np.arange(0, n, _STRIDE), n - 1))
@@ -212,6 +232,8 @@ class ArmPlanner:
             calm = plan.speed <= _CALM or calmed > _CALMING or self.begun
             patience = _PATIENCE if best.clearance.room > -_FAR else _LESS_PATIENCE
             if (plan.clearance.room >= 0.0 and calm) or since > patience:
+                break
+            if not self._effort.spend(1.0 if len(samples) < len(self.times) else _ALL_SAMPLES):
                 break
             gaps = self.around.gaps(path, self.clock[samples], _REACH) if gaps is None else gaps
             if plan.complete and plan.clearance.room < 0.0 and gaps.room.min(initial=1.0) >= 0.0:

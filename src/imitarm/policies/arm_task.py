@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.kinematics.arm import ArmModel
 from imitarm.policies.approach import Approach
-from imitarm.policies.arm_planner import ArmPlan
+from imitarm.policies.arm_planner import ArmPlan, Effort
 from imitarm.policies.least_detour import AllowedDirections
 from imitarm.policies.prediction_margin import PredictionMargin
 from imitarm.policies.remainder import Remainder
@@ -60,6 +60,7 @@ class ArmTask:
         hold: the arm must keep its clearances at the goal for this long after the arrival [s].
         max_attempts: largest number of attempts of the search; None: no limit. Attempts that only execute the path
             later are not counted.
+        effort: how long the search may take.
     """
 
     arm: ArmModel
@@ -74,3 +75,4 @@ class ArmTask:
     margins: Sequence[PredictionMargin | None] | None = None
     hold: float = 0.0
     max_attempts: int | None = None
+    effort: Effort = field(default_factory=lambda: Effort(np.inf))

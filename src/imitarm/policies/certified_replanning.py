@@ -23,7 +23,7 @@ from imitarm.policies.replanning import replan
 from imitarm.policies.stopping import Stop, certified_stop
 from imitarm.scene.scene import Scene
 from imitarm.skills.skill import Skill
-from imitarm.validation import finite_number
+from imitarm.validation import finite_number, whole_number
 
 Array = NDArray[np.float64]
 
@@ -31,7 +31,8 @@ _STANDS = 0.01  # [rad/s] an arm whose joints are all slower than this is at res
 _STANDING = 0.02  # [m/s] an obstacle slower than this can't be waited for
 _LAST = 0.1  # [s] before the goal, no further plan is made
 _BACK = 4  # every so many plans, the learned path is tried instead of the last plan
-_SOME, _MOST = 2, 12  # attempts of a plan from rest, first and later; one if the arm moves
+_SOME, _MOST = 2, 12  # attempts of a thorough search from rest, first and later; one of any other search
+_PAUSE, _THOROUGH = 8, 4  # every so many searches from rest are thorough; so many times more rounds
 _SAME_START = 1e-4  # [m, rad] a start nearer than this to the learned one is the learned one
 
 
@@ -92,6 +93,8 @@ class CertifiedRCAMO(Policy):
             this long, too.
         gain: feedback gain of the joint positions [1/s].
         arrival: the motion has arrived when the tool is nearer than this to the goal [m].
+        max_rounds: largest number of rounds of one search while the arm moves, which limits the computing time; the
+            next search goes on where this one ended. See :func:`~imitarm.policies.replan`. None: no limit.
         options: arguments of :class:`~imitarm.policies.Policy`; ``arm`` is required.
 
     Attributes:
@@ -114,6 +117,7 @@ class CertifiedRCAMO(Policy):
         hold: float = 0.5,
         gain: float = 8.0,
         arrival: float = 0.003,
+        max_rounds: int | None = 5,
         **options: Any,
     ) -> None:
         super().__init__(skill, **options)
@@ -125,6 +129,7 @@ class CertifiedRCAMO(Policy):
         self._planning_time = finite_number(planning_time, f"{name}: planning_time", "s", at_least=0.0)
         self._hold = finite_number(hold, f"{name}: hold", "s", above=0.0)
         self._gain = finite_number(gain, f"{name}: gain", "1/s", above=0.0)
+        self._rounds = None if max_rounds is None else whole_number(max_rounds, f"{name}: max_rounds", at_least=1)
         self._arrival = finite_number(arrival, f"{name}: arrival", "m", above=0.0)
         self._margin: dict[str, Any] = {"margin": margin, "margin_horizon": margin_horizon}
         margins_in(Scene(), **self._margin)
@@ -165,6 +170,8 @@ class CertifiedRCAMO(Policy):
         self._base: PlanInExecution | None = None
         self._stopping: _Stopping | None = None
         self._evades, self._attempts = False, _SOME
+        self._guess: Array | None = None
+        self._failures = 0
         self._learned, self._reason, self._since = 0.0, "", observation.time
         self._due = observation.time + self._period
         self.evasion.reset(observation)
@@ -238,7 +245,7 @@ class CertifiedRCAMO(Policy):
 
     def _follow(self, plan: PlanInExecution) -> None:
         self._plan, self._stopping, self._evades, self._reason = plan, None, False, ""
-        self._attempts = _SOME
+        self._attempts, self._guess, self._failures = _SOME, None, 0
 
     def _void(self, observation: Observation, scene: Scene) -> bool:
         """Give up the plan if its certificate is void; return whether it was."""
@@ -266,22 +273,25 @@ class CertifiedRCAMO(Policy):
         time = observation.time
         then = time + self._planning_time
         ahead, state = scene.now(then), self._state_at(then, observation)
+        resting = float(np.abs(state.velocity).max()) < _STANDS
         plan = self._plan or self._last
+        thorough = resting and self._plan is None and self._failures % _PAUSE == _PAUSE - 1
         if self._plan is not None and self._plan.end - then < _LAST:
             return
-        resting = float(np.abs(state.velocity).max()) < _STANDS
         learned = self._learned if self._plan is None else self._plan.learned_at(then)
         if plan is None or (learned == 0.0 and resting and self._plan is None):
             if not resting:
                 return
-            found, learned = self._adapted(state, ahead, self._attempts), 0.0
+            found, learned = self._adapted(state, ahead, self._attempts if thorough else 1), 0.0
         else:
-            found = self._replanned(plan, learned, state, ahead, self._attempts if resting and not self._plan else 1)
+            found = self._replanned(plan, learned, state, ahead, self._attempts if thorough else 1)
         if not found.feasible:
             if self._plan is None:
+                self._guess = found.displacement
                 self._reason = found.reason
-                if resting:  # there is time to search more thoroughly, and less often
-                    self._attempts, self._due = min(self._attempts + 1, _MOST), self._due + self._period
+                if thorough:
+                    self._attempts = min(self._attempts + 1, _MOST)
+                self._failures = self._failures + 1 if resting else 0
             return
         new = self._begun(found, then, learned, ahead)
         if self._planning_time > 0.0:
@@ -294,15 +304,20 @@ class CertifiedRCAMO(Policy):
     ) -> Adaptation:
         """Plan the rest of the motion, sometimes along the learned path again, otherwise along the last plan."""
         options: dict[str, Any] = {**self._options, "max_attempts": attempts}
+        if self._rounds is not None:
+            options["max_rounds"] = self._rounds * (1 if attempts == 1 else _THOROUGH)
         base, self.plans = self._base, self.plans + 1
         if base is not None and base is not plan and plan.adaptation.moved.any() and self.plans % _BACK == 0:
             phase = base.phase_of(learned)
             if phase < base.adaptation.trajectory.times[-1]:
-                found = replan(base.adaptation, scene, state=state, phase=phase, **options)
+                found = replan(base.adaptation, scene, state=state, phase=phase, **{**options, "max_rounds": 1})
                 if found.feasible and not found.moved.any():
                     return found
         last = plan.adaptation.trajectory.times[-1]
         phase = min(plan.phase_of(learned), float(last) - 1e-3)
+        guess = self._guess
+        if guess is not None and guess.shape == plan.adaptation.displacement.shape:
+            options["displacement"] = guess
         return replan(plan.adaptation, scene, state=state, phase=phase, **options)
 
     def _state_at(self, time: float, observation: Observation) -> ArmState:

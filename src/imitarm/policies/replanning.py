@@ -13,6 +13,7 @@ from imitarm.kinematics.arm import ArmModel, ArmState
 from imitarm.perception.margins import CoverageMargin
 from imitarm.policies.adaptation import allowed_directions, depends_on_time, of_whole_arm, tilt_limits
 from imitarm.policies.adapted_path import Adaptation
+from imitarm.policies.arm_planner import Effort
 from imitarm.policies.arm_task import ArmTask
 from imitarm.policies.component_path import STILL
 from imitarm.policies.prediction_margin import margins_in
@@ -20,7 +21,7 @@ from imitarm.policies.remainder import Remainder
 from imitarm.policies.whole_arm import solve
 from imitarm.scene.scene import Scene
 from imitarm.trajectory import Trajectory
-from imitarm.validation import finite_number, instance
+from imitarm.validation import finite_array, finite_number, instance, whole_number
 
 _BEYOND = 1.03  # times the measured tilt: a planner does not use the whole limit
 
@@ -41,6 +42,8 @@ def replan(
     margin_horizon: float | None = None,
     hold: float = 0.0,
     max_attempts: int | None = None,
+    max_rounds: int | None = None,
+    displacement: ArrayLike | None = None,
 ) -> Adaptation:
     """Plan the rest of a motion again, for example because an obstacle has moved.
 
@@ -71,6 +74,10 @@ def replan(
         max_attempts: largest number of attempts in the search for a joint path, to limit the computing time; None: no
             limit. The search may also try to execute the path later, so that obstacles pass first; such attempts are
             not counted.
+        max_rounds: largest number of rounds of the whole search. Each round improves a joint path once. This limits the
+            computing time more tightly than ``max_attempts``. None: no limit.
+        displacement: displacements of the components with which the search begins, such as those of a search that ended
+            after ``max_rounds``, shape (n_components, 3) [m]; None: those of ``previous``.
 
     Returns:
         The adaptation of the rest of the motion; check ``feasible`` before executing it. If it is not feasible, the arm
@@ -102,6 +109,9 @@ def replan(
     rest = Remainder.of(plan, float(np.interp(now, done, times)), state)
     limit = tilt_limits(rest.components, max_tilt, at_goal)
     limit = np.maximum(limit, _BEYOND * np.linalg.norm(rest.tilts.fixed, axis=1))  # where the arm is, it may be
+    begin = rest.displacement
+    if displacement is not None:
+        begin = finite_array(displacement, begin.shape, "displacement", "m")
     around = margins_in(scene, margin, margin_horizon)
     positions, quaternions = previous.nominal.at(rest.components.nominal.times + rest.begins)
     nominal = Trajectory(rest.components.nominal.times, positions, quaternions)
@@ -115,12 +125,13 @@ def replan(
         approach=None,
         arm_plan=None,
     )
+    effort = Effort(np.inf if max_rounds is None else whole_number(max_rounds, "max_rounds", at_least=1))
     extras = (extra, 0.0) if previous.certified_clearance >= clearance + extra else (0.0,)
     for more in dict.fromkeys(extras):
         task = ArmTask(arm, q, scene, clearance + more, allowed, limit, at_goal, more, rest, around)
-        task = replace(task, hold=rest_at_goal, max_attempts=max_attempts)
-        solution = solve(task, rest.components, rest.displacement)
+        task = replace(task, hold=rest_at_goal, max_attempts=max_attempts, effort=effort)
+        solution = solve(task, rest.components, begin)
         found = of_whole_arm(unplanned, solution, scene, clearance + more, began, around)
-        if found.feasible:
+        if found.feasible or effort.left <= 0.0:
             break
     return found

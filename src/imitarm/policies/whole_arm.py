@@ -48,8 +48,10 @@ _REACH = 0.15  # [m] largest clearance that is reported
 _RETIMINGS = 6  # among moving obstacles
 _SPARE = 2e-3  # [m] of clearance that is planned for, because new execution times change the distances
 _AHEAD = 0.05  # of the duration: a place this close to the goal is the goal
+_FOR_LATER = 2.0  # rounds of a limited search that are kept for attempts to execute the path later
 _MOST_SCHEDULES, _FEW_SCHEDULES = 4, 2  # for which a plan is made: usually, when the time is limited
 _DELAY_FOR_ROOM = 40.0  # [s/m] a schedule that lacks a centimetre is as good as one that takes 0.4 s longer
+_LOOKED = 3  # every so many coarse samples are compared with a schedule
 _SLOW, _KEPT_RATE = 0.02, 0.9  # rate of an arm that rests; fraction of the present rate with which a plan must begin
 _SIDES = 8  # directions tried across the path
 _AWAY = (0.1, 0.2)  # [m] by which the path is moved to another side
@@ -81,7 +83,10 @@ def solve(task: ArmTask, path: ComponentPath, displacement: Array) -> ArmSolutio
             if more < 0:
                 break
         planner, moved, joints, tilt = attempt
+        kept = _FOR_LATER if tried == 0 and search.moving else 0.0
+        task.effort.left -= kept
         plan = planner.plan(moved, joints, tilt)
+        task.effort.left = max(task.effort.left, 0.0) + kept
         if plan is not None and not plan.feasible:
             best = plan if best is None or _rank(plan) > _rank(best) else best
             search.failed(planner, plan)
@@ -137,7 +142,7 @@ class _Search:
         self._tilts = Tilts.between_ends(self._times, tilted_goal=task.goal_tilt > 0.0, window=path.at_pins)
         self._margins = task.margins or (None,) * len(task.scene.obstacles)
         growing = any(margin is not None and margin.growth > 0.0 for margin in self._margins)
-        self._moving = growing or any(obstacle.velocity.any() for obstacle in task.scene.obstacles)
+        self.moving = growing or any(obstacle.velocity.any() for obstacle in task.scene.obstacles)
         self._first: _Attempt | None = None
         self._worst: ArmClearance | None = None
         self._slow_tool = False
@@ -151,8 +156,9 @@ class _Search:
         The order of the attempts is given at the beginning of this module.
         """
         learned, detour, rest = self._planner(self._components), self._displacement, self.task.rest
-        begin = self._followed(learned, detour)
-        if rest is not None:
+        if rest is None:
+            begin = self._followed(learned, detour)
+        else:
             begin = _Attempt(learned, detour, rest.joints[learned.coarse], rest.tilt)
         self._first = begin
         yield begin
@@ -206,7 +212,7 @@ class _Search:
 
     def _other_starts(self, displacement: Array, goals: Sequence[GoalPosture]) -> Iterator[_Attempt]:
         """Yield first guesses for a joint path that ends in a clear posture; its start posture is not prescribed."""
-        if self._moving or self.task.rest is not None:  # there is no time for an approach
+        if self.moving or self.task.rest is not None:  # there is no time for an approach
             return
         planner = self._planner(self._components, free_start=True)
         for goal in goals:
@@ -273,8 +279,9 @@ class _Search:
             smoothness=smoothness,
             free_start=free_start,
             begun=rest is not None,
-            spare=_SPARE if self._moving else 0.0,
+            spare=_SPARE if self.moving else 0.0,
             quick=self.task.max_attempts == 1,
+            effort=self.task.effort,
         )
 
     def _followed(self, planner: ArmPlanner, displacement: Array, goal: GoalPosture | None = None) -> _Attempt:
@@ -318,24 +325,29 @@ class _Search:
         The first guess of the attempt is compared with all schedules, at a few samples. A plan is then made for the
         best schedules.
         """
-        if not self._moving:
+        if not self.moving:
             return None
         planner, displacement, joints, tilt = attempt
         path = ArmPath.of(self.task.arm, joints)
         clock = self._timing(path, self._times[planner.coarse], self._times[planner.coarse], None).times
         clock = np.interp(self._times, self._times[planner.coarse], clock)
-        rated: list[tuple[float, float, Schedule]] = []
-        for schedule in schedules(self._times, clock, at_rest=self.task.rest is None or self.task.rest.rate < _SLOW):
-            room = self._around.clearance_at(path, schedule.clock[planner.coarse], 0.0).room
-            room = min(room, self._held(joints[-1], float(schedule.clock[-1])))
-            rated.append((schedule.delay + _DELAY_FOR_ROOM * max(-room, 0.0), room, schedule))
+        possible = schedules(self._times, clock, at_rest=self.task.rest is None or self.task.rest.rate < _SLOW)
+        rooms = self._rooms(joints, planner.coarse, possible)
+        rated = [
+            (schedule.delay + _DELAY_FOR_ROOM * -room, room, schedule)
+            for schedule, room in zip(possible, rooms, strict=True)
+        ]
         most = _MOST_SCHEDULES if self.task.max_attempts is None else _FEW_SCHEDULES
         rated.sort(key=lambda one: one[0])
         chosen = [schedule for _, _, schedule in rated[:most]]
         clear = [schedule for _, room, schedule in rated if room >= 0.0]
         if clear and clear[0] not in chosen:
             chosen[-1] = clear[0]
+        if self.task.effort.left < np.inf:  # first one that needs no other path
+            chosen.sort(key=lambda schedule: schedule not in clear)
         for schedule in chosen:
+            if not self.task.effort.spend():
+                break
             planner.clock = schedule.clock
             plan = planner.plan(displacement, joints, tilt)
             timed = None if plan is None or not plan.feasible else self.timed(planner, plan, schedule.fastest)
@@ -343,6 +355,18 @@ class _Search:
                 return ArmSolution(*timed, "")
         planner.clock = self._times
         return None
+
+    def _rooms(self, joints: Array, coarse: Index, possible: list[Schedule]) -> list[float]:
+        """Return the smallest clearance of joints at the coarse samples for each schedule, at most 0 [m].
+
+        Some of the samples are looked at, and the goal also some time after the arrival.
+        """
+        looked = np.unique(np.append(np.arange(0, len(coarse), _LOOKED), len(coarse) - 1))
+        after = self.task.hold * np.array([0.5, 1.0])
+        clocks = np.array([schedule.clock[coarse[looked]] for schedule in possible])
+        clocks = np.concatenate([clocks, clocks[:, -1:] + after], axis=1)
+        postures = np.concatenate([joints[looked], np.tile(joints[-1], (len(after), 1))])
+        return [float(room) for room in self._around.rooms_at(postures, clocks)]
 
     def _held(self, joints: Array, time: float) -> float:
         """Return the clearance of a posture that is held from a time on, at most 0 [m]."""
@@ -363,9 +387,11 @@ class _Search:
             plan: the plan.
             fastest: largest rate ds/dt at each sample, shape (n,); None: 1.
         """
-        for _ in range(_RETIMINGS):
+        for tried in range(_RETIMINGS):
+            if tried and not self.task.effort.spend():
+                break
             timing = self._timing(plan.path, self._times, planner.clock, fastest)
-            if timing.blocked >= 0 or not self._moving:
+            if timing.blocked >= 0 or not self.moving:
                 return plan, timing
             if fastest is not None and self.task.rest is not None and timing.rate < _KEPT_RATE * self.task.rest.rate:
                 return None  # the arm is too fast to brake in time
@@ -426,7 +452,9 @@ class _Search:
             )
         if best is None:
             return f"{self.task.arm.name} can't move its tool along the path: move the path nearer to the arm"
-        first = f"on the path planned for the tool alone, {self._placed(self._on_first_path())}; "
+        first = ""
+        if self.task.rest is None:
+            first = f"on the path planned for the tool alone, {self._placed(self._on_first_path())}; "
         if self._goals is not None and not self._goals.found:
             best_posture = self._goals.best
             nearest = "" if best_posture is None else f" (in the best posture, {self.named(best_posture)})"
