@@ -236,6 +236,21 @@ def test_a_plan_is_certified_again_for_obstacles_elsewhere_if_its_rest_is_clear_
                 assert away >= again.certified + 0.005 + 0.02 * min(time - 2.5, 1.0) - 1e-6
 
 
+@pytest.mark.parametrize("track", [None, 7])
+def test_among_tracked_obstacles_the_near_future_is_enough(track):
+    plan, _, box = begun()
+    _, arm, _ = carrying("sawyer")
+    goal, way = plan.trajectory.positions[-1], np.array([0.0, 0.9, 0.0])
+    place, velocity = Pose(goal + way, UPRIGHT), -way / (plan.end - 2.5)
+    comes = replace(box, pose=place, velocity=velocity, angular_velocity=np.zeros(3), track_id=track)
+    again = plan.certified_again(arm, Scene(None, [comes], stamp=2.5), (None,), 0.5, 1.0)
+    assert (again is None) == (track is None)
+    if again is not None:
+        assert again.until == pytest.approx(3.5) and again.certified >= plan.clearance
+        late = Scene(None, [comes.after(plan.end - 2.8)], stamp=plan.end - 0.3)
+        assert plan.certified_again(arm, late, (None,), 0.5, 1.0) is None
+
+
 def test_the_time_in_the_learned_motion_and_the_phase_are_inverse():
     plan, _, _ = begun()
     for time in np.linspace(2.0, plan.end, 15):
@@ -363,7 +378,7 @@ def test_an_obstacle_that_stays_on_the_goal_is_waited_for_and_named():
         now = velocity if left else np.zeros(3)
         return Scene(None, [Sphere(skill.goal_.position - left * velocity, 0.04, velocity=now, name="cup")], stamp=time)
 
-    policy = policy_of("sawyer", rate=5.0)
+    policy = policy_of("sawyer", rate=5.0, patience=10.0)
     _, joints, commands, arrived = executed(policy, arm, start, truth, timeout=4.5)
     assert not arrived
     last = commands[-1]

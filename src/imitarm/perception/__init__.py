@@ -15,6 +15,7 @@ from imitarm.perception.point_cloud import PointCloud
 from imitarm.perception.segmentation import fit_plane
 from imitarm.perception.self_filter import SelfFilter
 from imitarm.perception.shape_choice import SHAPES
+from imitarm.perception.steady_velocity import SteadyVelocities
 from imitarm.perception.target import Target
 from imitarm.perception.tracker import ObstacleTracker
 from imitarm.perception.tracks import TrackedObstacle
@@ -33,6 +34,7 @@ __all__ = [
     "PersonCapsules",
     "PointCloud",
     "SelfFilter",
+    "SteadyVelocities",
     "Target",
     "TrackedObstacle",
     "assign",

@@ -12,6 +12,7 @@ from imitarm.command import Command, Status
 from imitarm.errors import InfeasibleError, InputError
 from imitarm.kinematics.arm import ArmState
 from imitarm.perception.margins import CoverageMargin
+from imitarm.perception.steady_velocity import SteadyVelocities
 from imitarm.policies.adaptation import adapt
 from imitarm.policies.adapted_path import Adaptation
 from imitarm.policies.component_path import STILL, ComponentPath
@@ -32,6 +33,8 @@ _STANDING = 0.02  # [m/s] an obstacle slower than this can't be waited for
 _LAST = 0.1  # [s] before the goal, no further plan is made
 _BACK = 4  # every so many plans, the learned path is tried instead of the last plan
 _SOME, _MOST = 2, 12  # attempts of a thorough search from rest, first and later; one of any other search
+_HORIZON = 1.5  # [s] that the certificate of a plan in execution must cover among tracked obstacles
+_AFRESH = 3  # every so many searches begin with the last plan, and not where the last search ended
 _PAUSE, _THOROUGH = 8, 4  # every so many searches from rest are thorough; so many times more rounds
 _SAME_START = 1e-4  # [m, rad] a start nearer than this to the learned one is the learned one
 
@@ -69,6 +72,12 @@ class CertifiedRCAMO(Policy):
     3. If neither a plan nor a stop is certified, for example because an obstacle comes towards the arm,
        :class:`~imitarm.policies.rcamo.RCAMO` commands the arm. The arm then evades without a certificate.
 
+    If no plan is certified for longer than ``patience``, RCAMO commands the arm as well, and the search goes on.
+
+    Tracked obstacles are predicted with noise. The velocities of those that move steadily are therefore measured over
+    a longer time (:mod:`~imitarm.perception.steady_velocity`). If the rest of a plan is no longer clear of a tracked
+    obstacle, the plan stays valid while its next 1.5 s are clear.
+
     In all cases the status and its reason name the obstacle, and the arm resumes as soon as a plan is certified. A
     :class:`~imitarm.safety.SafetyFilter` should check every command, as for all policies. If obstacles at rest make the
     motion impossible, ``reset`` refuses to start. If a moving obstacle makes the motion impossible, the arm waits.
@@ -95,6 +104,7 @@ class CertifiedRCAMO(Policy):
         arrival: the motion has arrived when the tool is nearer than this to the goal [m].
         max_rounds: largest number of rounds of one search while the arm moves, which limits the computing time; the
             next search goes on where this one ended. See :func:`~imitarm.policies.replan`. None: no limit.
+        patience: time without a certified plan after which RCAMO commands the arm instead of waiting [s].
         options: arguments of :class:`~imitarm.policies.Policy`; ``arm`` is required.
 
     Attributes:
@@ -118,6 +128,7 @@ class CertifiedRCAMO(Policy):
         gain: float = 8.0,
         arrival: float = 0.003,
         max_rounds: int | None = 5,
+        patience: float = 1.0,
         **options: Any,
     ) -> None:
         super().__init__(skill, **options)
@@ -129,6 +140,7 @@ class CertifiedRCAMO(Policy):
         self._planning_time = finite_number(planning_time, f"{name}: planning_time", "s", at_least=0.0)
         self._hold = finite_number(hold, f"{name}: hold", "s", above=0.0)
         self._gain = finite_number(gain, f"{name}: gain", "1/s", above=0.0)
+        self._patience = finite_number(patience, f"{name}: patience", "s", at_least=0.0)
         self._rounds = None if max_rounds is None else whole_number(max_rounds, f"{name}: max_rounds", at_least=1)
         self._arrival = finite_number(arrival, f"{name}: arrival", "m", above=0.0)
         self._margin: dict[str, Any] = {"margin": margin, "margin_horizon": margin_horizon}
@@ -171,7 +183,7 @@ class CertifiedRCAMO(Policy):
         self._stopping: _Stopping | None = None
         self._evades, self._attempts = False, _SOME
         self._guess: Array | None = None
-        self._failures = 0
+        self._failures, self._velocities = 0, SteadyVelocities()
         self._learned, self._reason, self._since = 0.0, "", observation.time
         self._due = observation.time + self._period
         self.evasion.reset(observation)
@@ -222,7 +234,7 @@ class CertifiedRCAMO(Policy):
         """
         if not self._started:
             raise InputError("CertifiedRCAMO.step: call reset(observation) first")
-        time, scene = observation.time, observation.scene.now(observation.time)
+        time, scene = observation.time, self._velocities.improved(observation.scene.now(observation.time))
         self._check_goal(scene)
         if self._next_plan is not None and time >= self._next_plan.began - 0.5 * dt:
             self._follow(self._next_plan)
@@ -256,9 +268,10 @@ class CertifiedRCAMO(Policy):
         late = plan.off_schedule(
             self._arm, time, observation.state, observation.tool_to_base, 0.5 * max(self.clearance, 0.01)
         )
-        reason = late or plan.unforeseen(scene)
+        ends = time > plan.until - _HORIZON + self._period
+        reason = late or plan.unforeseen(scene) or ("the certificate of the plan ends" if ends else "")
         if reason and not late:
-            again = plan.certified_again(self._arm, scene, margins_in(scene, **self._margin), self._hold)
+            again = plan.certified_again(self._arm, scene, margins_in(scene, **self._margin), self._hold, _HORIZON)
             if again is not None:
                 plan, self._plan, reason = again, again, ""
         if not reason:
@@ -315,7 +328,7 @@ class CertifiedRCAMO(Policy):
                     return found
         last = plan.adaptation.trajectory.times[-1]
         phase = min(plan.phase_of(learned), float(last) - 1e-3)
-        guess = self._guess
+        guess = self._guess if self.plans % _AFRESH else None
         if guess is not None and guess.shape == plan.adaptation.displacement.shape:
             options["displacement"] = guess
         return replan(plan.adaptation, scene, state=state, phase=phase, **options)
@@ -339,7 +352,8 @@ class CertifiedRCAMO(Policy):
         stop = certified_stop(
             self._arm, observation.state, scene, clearance=self.clearance, horizon=self._hold + 0.5, **self._margin
         )
-        if stop.certified:
+        tired = observation.time - self._since > self._patience
+        if stop.certified and not tired:
             self._stopping, self._evades = _Stopping(stop, observation.time), False
             return
         self._stopping = None

@@ -58,6 +58,7 @@ class PlanInExecution:
         approach: duration of the motion to the first posture of the path [s]; it is part of the plan.
         trajectory: the tool's path of the whole motion, from time 0.
         joints: the joint positions at the samples of ``trajectory``, shape (n, n_joints) [rad].
+        until: the time at which the certificate ends [s]; inf: it covers the whole plan.
     """
 
     adaptation: Adaptation
@@ -71,6 +72,7 @@ class PlanInExecution:
     approach: float
     trajectory: Trajectory
     joints: Array
+    until: float = np.inf
 
     @classmethod
     def of(
@@ -192,25 +194,38 @@ class PlanInExecution:
         )
 
     def certified_again(
-        self, arm: ArmModel, scene: Scene, margins: Sequence[PredictionMargin | None], hold: float
+        self,
+        arm: ArmModel,
+        scene: Scene,
+        margins: Sequence[PredictionMargin | None],
+        hold: float,
+        horizon: float = np.inf,
     ) -> PlanInExecution | None:
         """Return the same plan with a new certificate for the observed obstacles; None if the rest is not clear.
+
+        Tracked obstacles are predicted with noise, so the far future is uncertain. If the whole rest is not clear of
+        them, the certificate may cover the near future only. The plan must then be certified again before it ends.
 
         Args:
             arm: the arm.
             scene: the obstacles as seen now; its stamp is now.
             margins: for each of these obstacles, its margin from now on, or None for an obstacle without a margin.
             hold: the arm must keep its clearances at the goal for this long after the arrival [s].
+            horizon: how far the certificate must reach among tracked obstacles [s]; inf: to the end.
         """
         now, times = scene.stamp, self.trajectory.times + self.began
         later = times > now
         times = np.concatenate([[now], times[later], [max(self.end, now) + hold]]) - now
         joints = np.concatenate([self.joints_at(now)[None], self.joints[later], self.joints[-1:]])
         around = ArmAmongObstacles(arm, scene.obstacles, self.clearance, margins=margins)
-        room = around.clearance_of(ArmPath.of(arm, joints), times).room
+        path, until = ArmPath.of(arm, joints), np.inf
+        room = around.clearance_of(path, times).room
+        near = int(np.searchsorted(times, horizon)) + 1
+        if room < 0.0 and near < len(times) and (np.asarray(scene.packed.track_ids) >= 0).any():
+            room, until = around.clearance_of(ArmPath.of(arm, joints[:near]), times[:near]).room, now + horizon
         if room < 0.0:
             return None
-        return replace(self, scene=scene, seen=now, margins=margins, certified=self.clearance + room)
+        return replace(self, scene=scene, seen=now, margins=margins, certified=self.clearance + room, until=until)
 
     def _allowed(self, time: float) -> Array:
         """Return the allowed error of each obstacle of the plan at a time [s], shape (n,) [m]."""
