@@ -248,7 +248,7 @@ def numbers_of_teachers(results: StaticResults) -> list[int]:
 
 
 def teachers_table(results: StaticResults) -> Table:
-    """Return a table of success and deviation by the number of teachers."""
+    """Return a table of success and deviation by the number of teachers, for methods that were run with all numbers."""
     numbers = numbers_of_teachers(results)
     common = common_seeds(results)
     rows = []
@@ -257,8 +257,10 @@ def teachers_table(results: StaticResults) -> Table:
         for n in numbers:
             found = results.of(row, lambda s, n=n: s[3] == n and not s[4] and s[:3] in common)  # type: ignore[misc]
             good = [r for r in found if is_success(r)]
-            cells += [rate(len(good), len(found)), mean([r.value("rmse") for r in good], 1e3)]
-        rows.append((row, *cells))
+            if found:
+                cells += [rate(len(good), len(found)), mean([r.value("rmse") for r in good], 1e3)]
+        if len(cells) == 2 * len(numbers):
+            rows.append((row, *cells))
     names = ["1 teacher" if n == 1 else f"{n} teachers" for n in numbers]
     columns = [c for name in names for c in (f"{name}: success % (95 %)>", f"{name}: RMSE [mm]>")]
     note = f"{len(common)} seeds, for which the scenes of every number of teachers have a solution."

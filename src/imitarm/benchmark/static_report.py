@@ -115,7 +115,9 @@ def _figures(results: StaticResults) -> list[Figure]:
     found = [
         Figure(success_chart(results, family), f"Success: {place(family)}", lines) for family in results.families()
     ]
-    found.append(Figure(obstacles_chart(results), "Success by the number of obstacles", lines))
+    found.append(
+        Figure(obstacles_chart(results), "Success by the number of obstacles", "Over the scenes that have a solution.")
+    )
     for name, unit, title in (
         ("plan_seconds", "time to compute [s]", "Fig 4.9: time to compute"),
         ("duration", "time to complete [s]", "Fig 4.9: time to complete"),
