@@ -8,7 +8,8 @@ from scipy.integrate import solve_ivp
 
 from imitarm.kinematics.pose import Pose, quaternion_exp
 from imitarm.policies import DistanceCost, GaussianCost
-from imitarm.policies.least_cost import LeastCost, Prediction, Response, allowed_axes, frame, headings
+from imitarm.policies.headings import allowed_axes, frame, headings
+from imitarm.policies.least_cost import LeastCost, Prediction, Response
 from imitarm.policies.obstacle_cost import Groups, PredictedObstacles
 from imitarm.scene import Box, Ellipsoid, Scene, Sphere
 from imitarm.skills.dynamical_systems import GAINS, Gains

@@ -14,7 +14,7 @@ from imitarm.policies.baselines.barrier import Barrier, nearest_velocity
 from imitarm.policies.baselines.baseline_policy import ToolGaps
 from imitarm.policies.baselines.modulation import Modulation, modulated
 from imitarm.policies.baselines.velocity_field import NearObstacles
-from imitarm.policies.least_cost import allowed_axes
+from imitarm.policies.headings import allowed_axes
 from imitarm.scene import HalfSpace, Scene, Sphere
 
 SKILL, PATH = learn(planar=False)

@@ -211,25 +211,26 @@ static int nearer(const void *a, const void *b)
     return one->index < other->index ? -1 : one->index > other->index;
 }
 
-/* Pairs of spheres of two links: group k begins with pair starts[k]; sums are the sums of the two radii. */
+/* Pairs of spheres of two links: group k begins with pair starts[k]; sums are the sums of the two radii. The numbers of
+ * the base's spheres, whose centres are base_centers, follow those of the arm. */
 typedef struct {
     int64_t n_pairs, n_groups;
     const int64_t *outer, *inner;
     const double *sums;
     const int64_t *starts;
+    const double *base_centers;
 } SpherePairs;
 
 /* Find every pair nearer than close, at most the nearest `most`, and the nearest pair of each of the n_groups nearest
  * groups that are nearer than near.
  *
- * centers (m, 3) of the arm's spheres, base_centers of those that follow them in the numbers of spheres. scratch: room
- * for n_pairs + n_groups pairs. Out: the pairs' indices in SpherePairs, ordered by distance, their distances, and their
+ * centers (m, 3) of the arm's spheres. scratch: room for n_pairs + n_groups pairs. Out: the pairs' indices in SpherePairs, ordered by distance, their distances, and their
  * rows (n each). Returns their number, at most most + n_groups.
  *
  * The distance less the clearance may shrink by gain (1/s) times itself; if it is negative, it must grow by retreat
  * times its magnitude. If no velocity between lower and upper (n) violates this for any pair, the result is 0. If lower
  * is null, this is not tested. */
-int64_t self_rows(const SpherePairs *pairs, const Arm *arm, const double *centers, const double *base_centers,
+int64_t self_rows(const SpherePairs *pairs, const Arm *arm, const double *centers,
                   int64_t n_groups, double near, double close, int64_t most, double clearance, double gain,
                   double retreat, const double *lower, const double *upper, Pair *scratch, int64_t *indices,
                   double *distances, double *rows)
@@ -246,7 +247,7 @@ int64_t self_rows(const SpherePairs *pairs, const Arm *arm, const double *center
         for (int64_t k = pairs->starts[g]; k < end; k++) {
             int64_t inner = pairs->inner[k];
             const double *a = centers + 3 * pairs->outer[k];
-            const double *b = inner < arm->m ? centers + 3 * inner : base_centers + 3 * (inner - arm->m);
+            const double *b = inner < arm->m ? centers + 3 * inner : pairs->base_centers + 3 * (inner - arm->m);
             double x = a[0] - b[0], y = a[1] - b[1], z = a[2] - b[2], sum = pairs->sums[k];
             double squared = x * x + y * y + z * z, within = sum + (nearest > close ? nearest : close);
             if (within < 0.0 || squared > within * within * (1.0 + 1e-12))
@@ -276,7 +277,7 @@ int64_t self_rows(const SpherePairs *pairs, const Arm *arm, const double *center
         Pair pair = b >= found || (a < kept && nearer(chosen + a, best + b) < 0) ? chosen[a++] : best[b++];
         int64_t outer = pairs->outer[pair.index], inner = pairs->inner[pair.index];
         const double *one = centers + 3 * outer;
-        const double *other = inner < arm->m ? centers + 3 * inner : base_centers + 3 * (inner - arm->m);
+        const double *other = inner < arm->m ? centers + 3 * inner : pairs->base_centers + 3 * (inner - arm->m);
         double length = pair.distance + pairs->sums[pair.index], normal[3];
         for (int64_t c = 0; c < 3; c++)
             normal[c] = (one[c] - other[c]) / length;

@@ -22,9 +22,11 @@ _OPTIONS = ("-O2", "-std=c11", "-ffp-contract=off", "-shared", "-fPIC")
 _I, _P, _D = ctypes.c_int64, ctypes.c_void_p, ctypes.c_double
 _FUNCTIONS: dict[str, tuple[Any, ...]] = {
     "imitarm_sources": (),
+    "least_cost_choice": (_P, _D, *[_P] * 6),
+    "least_cost_scratch": (_P, _I),
     "obstacle_rows": (_P, _D, _D, *[_P] * 12),
     "sphere_centers": (_P, _P),
-    "self_rows": (*[_P] * 4, _I, _D, _D, _I, _D, _D, _D, *[_P] * 6),
+    "self_rows": (*[_P] * 3, _I, _D, _D, _I, _D, _D, _D, *[_P] * 6),
     "track_kernel_update": (*[_I] * 3, *[_D] * 4, *[_P] * 4),
 }
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,13 +11,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.policies.obstacle_cost import Groups, ObstacleCost, PredictedObstacles
+from imitarm.compiled.kernels import Record
+from imitarm.policies.obstacle_cost import DistanceCost, Groups, ObstacleCost, PredictedObstacles
 from imitarm.skills.dynamical_systems import Gains
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-_UP = np.array([0.0, 0.0, 1.0])
 _TOUCHES = 1e-6  # [m] of the clearance at the goal
 _TIED = 1e-13  # costs that differ by less are equal: it is above the rounding of symmetric scenes
 
@@ -71,70 +70,6 @@ class Response(NamedTuple):
     def free(self, deviation: Array) -> Array:
         """Return the deviations (k, 3) [m] that follow from ``deviation`` = [e_0; e_0'] (2, 3) without coupling."""
         return self.A[:, None] * deviation[0] + self.B[:, None] * deviation[1]
-
-
-def allowed_axes(forbidden: Array) -> tuple[Array, Array]:
-    """Return the space in which a path may be displaced.
-
-    Args:
-        forbidden: directions in which the path must not be displaced, unit rows (m, 3).
-
-    Returns:
-        An orthonormal basis of the d directions that are permitted at least one way, as columns, shape (3, d); and the
-        directions that are forbidden only one way, in this basis, shape (m', d).
-    """
-    both = np.any(forbidden @ forbidden.T < -1.0 + 1e-9, axis=1)
-    _, size, basis = np.linalg.svd(np.concatenate([np.zeros((1, 3)), forbidden[both]]))
-    axes = basis[np.count_nonzero(size > 1e-9) :].T
-    return axes, forbidden[~both] @ axes
-
-
-def headings(axes: Array) -> Array:
-    """Return unit vectors of coordinates in the frame of :func:`frame`: 26 in space, 12 in a plane, 2 on a line.
-
-    Args:
-        axes: orthonormal basis of the directions in which the tool may deviate, as columns, shape (3, d).
-    """
-    d = axes.shape[1]
-    if d == 2:
-        angles = np.arange(12) * (np.pi / 6.0)
-        return np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    grid = np.array(list(itertools.product((1.0, 0.0, -1.0), repeat=d))).reshape(-1, d)
-    grid = grid[grid.any(axis=1)] if d else grid[:0]
-    return np.asarray(grid / np.linalg.norm(grid, axis=1, keepdims=True))
-
-
-def frame(tangent: Array, axes: Array) -> Array:
-    """Return an orthonormal frame (3, d) of the directions ``axes`` (3, d): along the motion, to its left, and up.
-
-    The frame depends only on the motion and the vertical. If a scene is rotated about the vertical, or mirrored, the
-    candidates are rotated or mirrored in the same way.
-    """
-    if axes.shape[1] == 3:
-        return _frame_in_space(*tangent.tolist())
-    along = axes @ (tangent @ axes)
-    length = float(np.sqrt(along.dot(along)))
-    if axes.shape[1] < 2 or length < 1e-6:
-        return axes
-    along = along / length
-    for other in (_UP, axes[:, 0], axes[:, 1]):
-        rest = axes @ (other @ axes)
-        rest = rest - along * along.dot(rest)
-        length = float(np.sqrt(rest.dot(rest)))
-        if length > 1e-3:
-            break
-    return np.stack([along, rest / length], axis=1)
-
-
-def _frame_in_space(x: float, y: float, z: float) -> Array:
-    """Return the frame of a motion in the direction (x, y, z); that of the base if the direction is 0 or vertical."""
-    across = math.hypot(x, y)
-    if across < 1e-3:
-        return np.eye(3)
-    length = math.hypot(across, z)
-    a, b, c = x / length, y / length, z / length
-    d = across / length
-    return np.array([[a, -b / d, -a * c / d], [b, a / d, -b * c / d], [c, 0.0, d]])
 
 
 class Prediction(NamedTuple):
@@ -201,7 +136,7 @@ class LeastCost:
         time_constant: tau, the time constant of the deviation [s].
         obstacle_cost: b, the cost of being near an obstacle.
         max_acceleration: a_max, the largest coupling acceleration [m/s^2].
-        units: headings in the frame of :func:`frame`, shape (k, d).
+        units: headings in the frame of :func:`~imitarm.policies.headings.frame`, shape (k, d).
         limit: largest acceleration of the deviation by u, spring and damper together [m/s^2].
         discount: gamma, the factor by which the weight decreases from one instant to the next.
         deviation_weight: w_e, weight of the deviation [1/m^2].
@@ -259,6 +194,38 @@ class LeastCost:
     def _waiting(self) -> Array:
         """The cost of each speed, shape (R,)."""
         return np.array([self.wait_weight * (1.0 - rate) ** 2 for rate in self.rates])
+
+    def record(self, spheres: Array, one_sided: Array, tool_radius: float, rate_time: float) -> Record:
+        """Return the C structure ``LeastCost``; the obstacle cost must be a :class:`DistanceCost`.
+
+        Args:
+            spheres: centres of the tool's spheres relative to its tip, shape (S, 3) [m].
+            one_sided: directions in which u must have no component, shape (m, 3).
+            tool_radius: largest distance of the tool's surface from its tip [m].
+            rate_time: time in which the phase takes up another speed [s].
+        """
+        cost, response, (task, pull, curvature) = self.obstacle_cost, self.response, self._task
+        assert isinstance(cost, DistanceCost)
+        candidates, rates = self._candidates[0], np.array(self.rates)
+        sizes = (*(len(x) for x in (self.times, spheres)), *candidates.shape, len(rates), len(one_sided))
+        arrays = (self.times, response.A, response.B, self._gains, self._weights, task, pull, candidates)
+        more = (one_sided, rates, self._waiting, cost.radii, spheres)
+        influence = float(cost.influence_distance)
+        return Record(
+            *sizes,
+            *[np.ascontiguousarray(x, dtype=float) for x in (*arrays, *more)],
+            curvature,
+            self.change_weight,
+            self.size_weight + self.change_weight,
+            self.limit / self.max_acceleration,
+            cost.clearance,
+            cost.width,
+            influence,
+            tool_radius + self.travel + influence,
+            float(np.abs(response.A - 1.0).max()),
+            float(np.abs(response.B).max()),
+            rate_time,
+        )
 
     @property
     def travel(self) -> float:
@@ -376,7 +343,7 @@ class LeastCost:
         cost = float(costs[rate, index])
         if cost > bound:
             return None
-        if index == 0 or found is None or not len(found.gaps):
+        if index == 0 or found is None or rate not in found.pairs.rate:
             each = free_gaps[rate].reshape(n, -1).min(axis=1)
             nearest = int(each.argmin())
             return rate, index, cost, nearest, float(each[nearest])

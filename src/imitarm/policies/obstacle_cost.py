@@ -128,7 +128,12 @@ class DistanceCost(ObstacleCost):
 
     def influence(self, packed: PackedObstacles) -> Array:
         """Return the distances beyond which the cost is negligible, shape (n,) [m]."""
-        return np.full(len(packed), self.clearance + _NEGLIGIBLE * self.width)
+        return np.full(len(packed), self.influence_distance)
+
+    @property
+    def influence_distance(self) -> float:
+        """Distance beyond which the cost is negligible [m]."""
+        return self.clearance + _NEGLIGIBLE * self.width
 
     def values(
         self,

@@ -9,6 +9,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from imitarm.compiled.kernels import Record
 from imitarm.kinematics.pose import Pose, quaternion_to_matrix
 from imitarm.skills.dmp import DMP
 from imitarm.skills.skill import Skill
@@ -113,6 +114,20 @@ class PrimitivePath:
         before, after = self.quaternions[i], self.quaternions[i + 1]
         between = before + (x - i) * (after if before.dot(after) >= 0.0 else -after) - (x - i) * before
         return np.asarray(between / np.sqrt(between.dot(between)))
+
+    def record(self, spheres: bool, hold: Array) -> Record:
+        """Return the C structure ``Path``.
+
+        Args:
+            spheres: whether the tool has spheres that are not at its tip, so that its rotation matters.
+            hold: rotation wxyz (4,) that the tool keeps if no rotation was learned.
+        """
+        rotations = np.zeros(0)
+        if spheres:
+            rotations = quaternion_to_matrix(hold) if self.rotations is None else np.ascontiguousarray(self.rotations)
+        tables = np.ascontiguousarray(self.positions), np.ascontiguousarray(self.precision)
+        goal = np.ascontiguousarray(self.goal.position, dtype=float)
+        return Record(N_SAMPLES, rotations.size // 9, *tables, rotations, goal, self.duration, self.speed)
 
     @cached_property
     def speed(self) -> float:

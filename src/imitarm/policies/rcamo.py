@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -10,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from imitarm.command import Command, Status
+from imitarm.compiled import library
+from imitarm.compiled.kernels import Record, address
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import (
     Pose,
@@ -19,11 +22,13 @@ from imitarm.kinematics.pose import (
     quaternion_to_matrix,
 )
 from imitarm.perception.margins import CoverageMargin
-from imitarm.policies.least_cost import STAY, Choice, LeastCost, Prediction, Response, allowed_axes, frame, headings
+from imitarm.policies.headings import allowed_axes, frame, headings
+from imitarm.policies.least_cost import STAY, Choice, LeastCost, Prediction, Response
 from imitarm.policies.obstacle_cost import DistanceCost, GaussianCost, Groups, ObstacleCost, PredictedObstacles
 from imitarm.policies.policy import Observation, Policy
 from imitarm.policies.primitive_path import PrimitivePath, learned_precision
 from imitarm.scene.distances import distances
+from imitarm.scene.packed_record import record_of
 from imitarm.scene.scene import Scene
 from imitarm.skills.dmp import DMP
 from imitarm.skills.dynamical_systems import Gains
@@ -136,6 +141,8 @@ class RCAMO(Policy):
         self._dmp, self._precision = _primitive(skill, self.gains), learned_precision(skill)
         self._steps: dict[float, Response] = {}
         self._path: PrimitivePath | None = None
+        self._path_record: tuple[PrimitivePath, Array, Record] | None = None
+        self._room_for, self._room, self._state, self._out = -1, np.zeros(0), np.zeros(30), np.zeros(6)
 
     # ----- start
 
@@ -190,6 +197,11 @@ class RCAMO(Policy):
             path = self._path = moved
         return path
 
+    @cached_property
+    def _record(self) -> Record:
+        """The C structure ``LeastCost``."""
+        return self.least_cost.record(self._spheres, self._one_sided, self._tool_radius, _RATE_TIME)
+
     # ----- each step
 
     def step(self, observation: Observation, dt: float) -> Command:
@@ -207,15 +219,15 @@ class RCAMO(Policy):
             shift = lag * (1.0 - self._patience / away)
             self._deviation[0] += shift
             reference, lag, away = reference + shift, lag - shift, self._patience
-        near = self._near(observation, path)
-        chosen = self._choose(path, lag, near)
+        chosen = self._choose(observation, path, lag)
+        self._scaled = chosen.scaled
         rate = chosen.rate * max(0.0, 1.0 - (away / self._patience) ** 2)
         phase = self._advance(rate, self.least_cost.max_acceleration * chosen.scaled, dt)
         moved = path.position(self._phase) + self._deviation[0]
         twist = np.empty(6)
         twist[:3] = (moved - reference) / dt - self._gain * lag
         twist[3:] = self._rotation(path, observation.tool_to_base, phase, dt)
-        return self._command(twist, observation, near, chosen, away)
+        return self._command(twist, observation, chosen, away)
 
     def _advance(self, rate: float, push: Array, dt: float) -> float:
         """Advance phase and deviation by ``dt``; return the phase before."""
@@ -238,10 +250,48 @@ class RCAMO(Policy):
         transient = (_RATE_TIME / self._dmp.duration_) * (1.0 - np.exp(times / -_RATE_TIME))
         return np.asarray(self._phase + rates * (times / self._dmp.duration_) + (self._rate - rates) * transient)
 
-    def _choose(self, path: PrimitivePath, lag: Array, near: _Near | None) -> Choice:
-        if near is None:
-            self._scaled = STAY.scaled
+    def _choose(self, observation: Observation, path: PrimitivePath, lag: Array) -> Choice:
+        """Return the choice; ``nearest`` is an index in the scene."""
+        if not len(observation.scene.packed):
             return STAY
+        kernel = library()
+        if kernel is not None and type(self.least_cost.obstacle_cost) is DistanceCost:
+            return self._compiled_choice(kernel, observation, path, lag)
+        near = self._near(observation, path)
+        if near is None:
+            return STAY
+        chosen = self._choose_by_numpy(path, lag, near)
+        return chosen if chosen.nearest < 0 else chosen._replace(nearest=int(near.indices[chosen.nearest]))
+
+    def _compiled_choice(self, kernel: Any, observation: Observation, path: PrimitivePath, lag: Array) -> Choice:
+        packed, path_record = observation.scene.packed, self._path_record
+        if path_record is None or path_record[0] is not path or path_record[1] is not self._hold:
+            path_record = self._path_record = path, self._hold, path.record(self._offset_spheres, self._hold)
+        (obstacles, dt), constants = record_of(packed), self._record.address
+        if self._room_for < len(packed):
+            self._room_for = len(packed)
+            self._room = np.empty(kernel.least_cost_scratch(constants, len(packed)))
+        elapsed, state, margins = observation.time - observation.scene.stamp, self._state, None
+        if self._margin is not None or packed.covariances.any():
+            margins = np.ascontiguousarray(self._margins(packed.covariances, elapsed))
+        axes = frame(path.tangent(self._phase), self._axes)
+        state[:3], state[3:6], state[6:12] = observation.tool_to_base.position, lag, self._deviation.ravel()
+        state[12:15], state[15:18] = self._scaled, self._spring() / self.least_cost.max_acceleration
+        state[18:21] = self._phase, self._rate, elapsed
+        state[21 : 21 + axes.size] = axes.ravel()
+        places = constants, path_record[2].address, address(state), None if margins is None else address(margins)
+        nearest = kernel.least_cost_choice(obstacles.address, dt, *places, address(self._room), address(self._out))
+        if nearest < 0:
+            return STAY
+        x, y, z, rate, cost, gap = self._out.tolist()
+        return Choice(np.array([x, y, z]), rate, cost, nearest, gap)
+
+    def _spring(self) -> Array:
+        """Return the acceleration of spring and damper, against the deviation, shape (3,) [m/s^2]."""
+        e, v = self._deviation
+        return np.asarray((self.gains.stiffness / self._tau**2) * e + (self.gains.damping / self._tau) * v)
+
+    def _choose_by_numpy(self, path: PrimitivePath, lag: Array, near: _Near) -> Choice:
         least_cost, times = self.least_cost, self.least_cost.times
         free = least_cost.response.free(self._deviation) + least_cost.response.A[:, None] * lag
 
@@ -258,11 +308,8 @@ class RCAMO(Policy):
             return Prediction(centers, phases >= 1.0, goal)
 
         axes = frame(path.tangent(self._phase), self._axes)
-        e, v = self._deviation
-        pull = (self.gains.stiffness / self._tau**2) * e + (self.gains.damping / self._tau) * v
-        chosen = least_cost.choose(axes, self._one_sided, self._scaled, free, precision, predict, near.obstacles, pull)
-        self._scaled = chosen.scaled
-        return chosen
+        given = free, precision, predict, near.obstacles, self._spring()
+        return least_cost.choose(axes, self._one_sided, self._scaled, *given)
 
     def _offsets(self, path: PrimitivePath, samples: NDArray[np.intp]) -> Array:
         """Return the centres of the tool's spheres relative to its tip, shape (R, H, S, 3) [m]."""
@@ -323,11 +370,9 @@ class RCAMO(Policy):
         size = float(np.sqrt(error.dot(error)))
         return forward + (error * (_FASTEST_TURN / size) if size > _FASTEST_TURN else error)
 
-    def _command(
-        self, twist: Array, observation: Observation, near: _Near | None, chosen: Choice, lag: float
-    ) -> Command:
-        if near is not None and chosen.nearest >= 0:
-            name = observation.scene.name_of(near.indices[chosen.nearest])
+    def _command(self, twist: Array, observation: Observation, chosen: Choice, lag: float) -> Command:
+        if chosen.nearest >= 0:
+            name = observation.scene.name_of(chosen.nearest)
             self._reason = f"{name}, predicted to come within {1e3 * chosen.gap:.0f} mm of the tool"
         deviation = float(np.sqrt(self._deviation[0].dot(self._deviation[0])))
         waits = self._rate < _STANDS and self._phase < 1.0

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,8 +19,7 @@ from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_kinematics import ArmMemory
 from imitarm.kinematics.ik_problem import Box, Rows
 from imitarm.kinematics.spheres import SphereCover
-from imitarm.scene.convex_hull import Polytope
-from imitarm.scene.distances import PackedObstacles
+from imitarm.scene.packed_record import record_of
 from imitarm.scene.scene import Scene
 
 Array = NDArray[np.float64]
@@ -68,7 +67,7 @@ def compiled_near_rows(
         box: bounds of the joint velocity; rows that no velocity within these bounds violates are left out.
     """
     packed = scene.packed
-    record, dt = _record_of(packed)
+    record, dt = record_of(packed)
     room = _room(memory, "near rows", len(packed) * len(reach), (3 * memory.n_joints + 1) * len(reach))
     places = *_arm_of(cover, memory), address(reach), limit.address
     more = [None if array is None else address(array) for array in (margins, velocity, *box)]
@@ -150,12 +149,8 @@ class SpherePairs:
     @cached_property
     def _record(self) -> Record:
         """The C structure of the same name."""
-        return Record(len(self.sums), len(self.starts), self.outer, self.inner, self.sums, self.starts)
-
-    @cached_property
-    def _base(self) -> int:
-        """Address of the centres of the base's spheres, which the cover keeps."""
-        return address(self.cover.base_centers)
+        arrays = self.outer, self.inner, self.sums, self.starts, self.cover.base_centers
+        return Record(len(self.sums), len(self.starts), *arrays)
 
     def distances(self, centers: Array) -> Array:
         """Return the distances of all pairs, shape (k,) [m]; ``centers`` (m, 3) [m] has the arm's centres."""
@@ -186,7 +181,7 @@ class SpherePairs:
         n_groups, _, _, most = nearness
         room = _room(memory, "own rows", most + n_groups, 2 * (len(self.sums) + len(self.starts)))
         bounds = (None, None) if box is None else (address(box.lower), address(box.upper))
-        places = self._record.address, *_arm_of(self.cover, memory), self._base
+        places = self._record.address, *_arm_of(self.cover, memory)
         k = kernel.self_rows(*places, *nearness, *demand, *bounds, *room.addresses)
         if not k:
             return None
@@ -263,47 +258,3 @@ def _arm_of(cover: SphereCover, memory: ArmMemory) -> tuple[int, int]:
         library().sphere_centers(*arm.places)
         arm.posture = memory.posture
     return arm.places
-
-
-def _record_of(packed: PackedObstacles) -> tuple[Record, float]:
-    """Return the C structure ``Obstacles``, and the time [s] from its poses to those of ``packed``."""
-    known: tuple[Record, float] | None = packed.__dict__.get("_record")
-    if known is None:
-        if "_ahead" in packed.__dict__:
-            earlier, dt = packed.__dict__["_ahead"]
-            record, before = _record_of(earlier)
-            known = record, before + dt
-        else:
-            known = _built(packed), 0.0
-        packed.__dict__["_record"] = known
-    return known
-
-
-def _built(packed: PackedObstacles) -> Record:
-    rows = (
-        packed.positions,
-        packed.quaternions,
-        packed.sizes,
-        packed.velocities,
-        packed.angular_velocities,
-        packed.covariances,
-        packed.radii,
-        packed.stamps,
-    )
-    kinds = np.ascontiguousarray(packed.kinds, dtype=np.int8)
-    hulls = [None if polytope is None else _hull_record(polytope) for polytope in packed.polytopes]
-    return Record(len(packed), kinds, *[_plain(row) for row in rows], hulls)
-
-
-def _hull_record(polytope: Polytope) -> Record:
-    """Return the C structure ``Hull``; the polytope keeps it."""
-    record: Record | None = polytope.__dict__.get("_record")
-    if record is None:
-        arrays = "normals", "offsets", "cosines", "starts", "directions", "lengths"
-        sizes = len(polytope.offsets), len(polytope.lengths)
-        record = polytope.__dict__["_record"] = Record(*sizes, *[_plain(getattr(polytope, name)) for name in arrays])
-    return record
-
-
-def _plain(array: Any) -> Array:
-    return np.ascontiguousarray(array, dtype=float)

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.policies.baselines.baseline_policy import ToolGaps
-from imitarm.policies.least_cost import allowed_axes
+from imitarm.policies.headings import allowed_axes
 from imitarm.trajectory import Trajectory
 from imitarm.validation import finite_array, finite_number
 

@@ -19,7 +19,7 @@ from imitarm.policies.baselines.expert import PathProblem, displaced_paths
 from imitarm.policies.baselines.path_cost import FEATURES, N_FREE, N_SAMPLES, PRECISION, RANGES, PathCost, bump, depth
 from imitarm.policies.baselines.reaction import Reaction
 from imitarm.policies.component_path import quintic_step
-from imitarm.policies.least_cost import allowed_axes
+from imitarm.policies.headings import allowed_axes
 from imitarm.scene.scene import Scene
 from imitarm.skills.skill import Skill
 from imitarm.trajectory import Trajectory

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from imitarm.errors import InfeasibleError
 from imitarm.policies.baselines.baseline_policy import BaselinePolicy, ToolGaps
 from imitarm.policies.baselines.reaction import Reaction
-from imitarm.policies.least_cost import allowed_axes
+from imitarm.policies.headings import allowed_axes
 from imitarm.scene.distances import PackedObstacles
 from imitarm.scene.scene import Scene
 from imitarm.skills.skill import Skill
