@@ -195,17 +195,21 @@ class ArmKinematics:
         Use this memory in loops that need several results for one posture. The kinematics are computed again only for a
         new posture. They are valid until a method is called with another posture.
         """
-        # The usual case is decided here: it is on the path of every control step.
-        usual = type(q) is np.ndarray and q.dtype is _FLOAT64 and q.shape == self._shape
-        if not (usual and math.isfinite(sum(q.tolist()))):  # type: ignore[union-attr]
-            q = self._checked(q, "q")
         memory: ArmMemory
         try:
             memory = self._local.memory
         except AttributeError:  # the first time in this thread
             sites = () if self.landmarks is None else self.landmarks.sites
             memory = self._local.memory = ArmMemory(self._model, self._posture, self._qpos, self._dofs, sites)
-        memory.move_to(q)  # type: ignore[arg-type]
+        # The usual cases are decided here: they are on the path of every control step.
+        if type(q) is np.ndarray and q.dtype is _FLOAT64 and q.shape == self._shape:
+            if q.tobytes() == memory.posture:
+                return memory
+            if not math.isfinite(sum(q.tolist())):
+                q = self._checked(q, "q")
+        else:
+            q = self._checked(q, "q")
+        memory.move_to(q)
         return memory
 
     def site(self, frame: str) -> int:
