@@ -141,6 +141,8 @@ class RCAMO(Policy):
         self._dmp, self._precision = _primitive(skill, self.gains), learned_precision(skill)
         self._steps: dict[float, Response] = {}
         self._path: PrimitivePath | None = None
+        self._learned_goal = skill.goal_
+        self._known: tuple[Pose | None, PrimitivePath | None] = None, None  # a goal, and the motion to it
         self._path_record: tuple[PrimitivePath, Array, Record] | None = None
         self._room_for, self._room, self._state, self._out = -1, np.zeros(0), np.zeros(30), np.zeros(6)
 
@@ -186,8 +188,8 @@ class RCAMO(Policy):
         path = self._path
         if path is None:
             raise InputError("RCAMO.step: call reset(observation) or resume(observation, phase) first")
-        goal = self.skill.goal_ if observation.scene.goal is None else observation.scene.goal
-        if goal is path.goal:
+        goal = self._learned_goal if observation.scene.goal is None else observation.scene.goal
+        if goal is path.goal or (goal is self._known[0] and path is self._known[1]):
             return path
         if not (
             np.array_equal(goal.position, path.goal.position) and np.array_equal(goal.quaternion, path.goal.quaternion)
@@ -195,6 +197,7 @@ class RCAMO(Policy):
             moved = path.to(goal)
             self._deviation[0] -= moved.position(self._phase) - path.position(self._phase)
             path = self._path = moved
+        self._known = goal, path
         return path
 
     @cached_property
@@ -240,9 +243,9 @@ class RCAMO(Policy):
         self._phase = min(max(self._phase + travelled / self._dmp.duration_, 0.0), 1.0)
         self._rate = rate + (self._rate - rate) * decay
         e, v = self._deviation
-        self._deviation = np.stack(
-            [one.A * e + one.B * v + one.G * push, one.a_rate * e + one.b_rate * v + one.g_rate * push]
-        )
+        self._deviation = np.empty((2, 3))
+        self._deviation[0] = one.A * e + one.B * v + one.G * push
+        self._deviation[1] = one.a_rate * e + one.b_rate * v + one.g_rate * push
         return before
 
     def _phases(self, rates: Array, times: Array) -> Array:
@@ -430,7 +433,7 @@ class RCAMO(Policy):
         """Return whether the phase is at its end, and the tool is nearer than ``arrival`` to the goal."""
         if self._path is None:
             return False
-        goal = self.skill.goal_ if observation.scene.goal is None else observation.scene.goal
+        goal = self._learned_goal if observation.scene.goal is None else observation.scene.goal
         away = observation.tool_to_base.position - goal.position
         return self._phase >= 1.0 and float(np.sqrt(away.dot(away))) < self._arrival
 
