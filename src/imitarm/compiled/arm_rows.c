@@ -211,12 +211,13 @@ static int nearer(const void *a, const void *b)
     return one->index < other->index ? -1 : one->index > other->index;
 }
 
-/* Pairs of spheres of two links: group k begins with pair starts[k]; sums are the sums of the two radii. The numbers of
- * the base's spheres, whose centres are base_centers, follow those of the arm. */
+/* Pairs of spheres of two links: group k begins with pair starts[k]; radii are those of all spheres. The numbers of the
+ * base's spheres, whose centres are base_centers, follow those of the arm. Numbers of spheres are short, so that all
+ * pairs stay in the processor's nearest cache. */
 typedef struct {
     int64_t n_pairs, n_groups;
-    const int64_t *outer, *inner;
-    const double *sums;
+    const uint16_t *outer, *inner;
+    const double *radii;
     const int64_t *starts;
     const double *base_centers;
 } SpherePairs;
@@ -248,7 +249,7 @@ int64_t self_rows(const SpherePairs *pairs, const Arm *arm, const double *center
             int64_t inner = pairs->inner[k];
             const double *a = centers + 3 * pairs->outer[k];
             const double *b = inner < arm->m ? centers + 3 * inner : pairs->base_centers + 3 * (inner - arm->m);
-            double x = a[0] - b[0], y = a[1] - b[1], z = a[2] - b[2], sum = pairs->sums[k];
+            double x = a[0] - b[0], y = a[1] - b[1], z = a[2] - b[2], sum = pairs->radii[pairs->outer[k]] + pairs->radii[inner];
             double squared = x * x + y * y + z * z, within = sum + (nearest > close ? nearest : close);
             if (within < 0.0 || squared > within * within * (1.0 + 1e-12))
                 continue;
@@ -278,7 +279,7 @@ int64_t self_rows(const SpherePairs *pairs, const Arm *arm, const double *center
         int64_t outer = pairs->outer[pair.index], inner = pairs->inner[pair.index];
         const double *one = centers + 3 * outer;
         const double *other = inner < arm->m ? centers + 3 * inner : pairs->base_centers + 3 * (inner - arm->m);
-        double length = pair.distance + pairs->sums[pair.index], normal[3];
+        double length = pair.distance + pairs->radii[outer] + pairs->radii[inner], normal[3];
         for (int64_t c = 0; c < 3; c++)
             normal[c] = (one[c] - other[c]) / length;
         for (int64_t c = 0; c < n; c++) /* joints that move both spheres do not change their distance */

@@ -149,7 +149,9 @@ class SpherePairs:
     @cached_property
     def _record(self) -> Record:
         """The C structure of the same name."""
-        arrays = self.outer, self.inner, self.sums, self.starts, self.cover.base_centers
+        outer, inner = self.outer.astype(np.uint16), self.inner.astype(np.uint16)
+        radii = np.concatenate([self.cover.radii, self.cover.base_radii])
+        arrays = outer, inner, radii, self.starts, self.cover.base_centers
         return Record(len(self.sums), len(self.starts), *arrays)
 
     def distances(self, centers: Array) -> Array:
