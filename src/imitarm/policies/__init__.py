@@ -7,6 +7,7 @@ from imitarm.policies.acfra import ACFRA
 from imitarm.policies.adaptation import ADAPTERS, HORIZONTAL_ONLY, NOT_DOWN, adapt
 from imitarm.policies.adapted_path import Adaptation
 from imitarm.policies.certified_replanning import CertifiedRCAMO
+from imitarm.policies.least_cost import LeastCost
 from imitarm.policies.least_detour import PathAdapter
 from imitarm.policies.obstacle_cost import DistanceCost, GaussianCost, ObstacleCost
 from imitarm.policies.path_policy import PathPlan, PathPolicy
@@ -55,6 +56,7 @@ __all__ = [
     "CertifiedRCAMO",
     "DistanceCost",
     "GaussianCost",
+    "LeastCost",
     "Observation",
     "ObstacleCost",
     "PathAdapter",
