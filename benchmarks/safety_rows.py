@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import tempfile
+import warnings
 from collections.abc import Callable
-from itertools import cycle
+from itertools import count, cycle
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,12 @@ from imitarm.control_loop import ContactDetector
 from imitarm.kinematics.arm import ArmModel, ArmState
 from imitarm.kinematics.ik import IKSolver
 from imitarm.kinematics.pose import Pose
+from imitarm.perception import Detection, ObstacleTracker
+from imitarm.policies import RCAMO, Observation
 from imitarm.safety import SafetyFilter
 from imitarm.scene import Scene, Sphere
+from imitarm.skills import Skill
+from imitarm.tasks.habits import demonstrations_by, s_shaped_reach
 from timing import Row
 from yardsticks import DT, mink_step, named
 
@@ -64,6 +69,47 @@ def tick_against_mink() -> Row:
     name = "safety filter, 5 moving obstacles, all links and self"
     reference = f"{named('mink')}, CollisionAvoidanceLimit"
     ours = _tick(arm, keeper, moving, states, target)
+    return Row(name, ours, lambda: peer(next(theirs).q), reference, faster=1.0, check=check)
+
+
+def _whole_tick(arm: ArmModel, keeper: SafetyFilter, scene: Scene, states: list[State]) -> Callable[[], Array]:
+    """Return one control tick with everything in it: detections, tracker, RCAMO, the filter of all links, IK."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        skill = Skill(6).fit(demonstrations_by(s_shaped_reach(planar=False), 3))
+    policy, tracker, ticks, noise = RCAMO(skill, arm=arm), ObstacleTracker(), count(), 1e-6 * np.eye(3)
+    rest = np.zeros(arm.n_joints)
+    n = len(states)
+    # the obstacles move to and fro, so that they stay near in a measurement of any length
+    there = [scene.at(DT * (k if k < n else 2 * n - k)).obstacles for k in range(2 * n)]
+    frames = [[Detection(obstacle, noise) for obstacle in obstacles] for obstacles in there]
+
+    def tick() -> Array:
+        k = next(ticks)
+        q, _, velocity = states[k % n]
+        tracker.update(k * DT, frames[k % (2 * n)])
+        now = Observation(k * DT, ArmState(q, velocity, rest, k * DT), arm.tool_pose(q), tracker.scene(k * DT))
+        if k == 0:
+            policy.reset(now)
+        elif k % n == 0:
+            policy.resume(now, 0.5)
+        return keeper.step(policy.step(now, DT), q, velocity, now.scene).velocity
+
+    return tick
+
+
+def whole_tick_against_mink() -> Row:
+    """A control tick with tracker, RCAMO and the safety filter among 5 moving obstacles, against mink's filter alone."""
+    arm, keeper, scene, states, target = _setup()
+    peer, theirs = avoiding_mink(arm, scene, states, target), cycle(states)
+    ours = _whole_tick(arm, keeper, _moving(scene), states)
+
+    def check() -> tuple[bool, str]:
+        finite = all(bool(np.all(np.isfinite(ours()))) for _ in range(200))
+        return finite, "ours: tracker, policy, all links and self; theirs: obstacles at rest, known exactly"
+
+    name = "whole control tick, 5 moving obstacles"
+    reference = f"{named('mink')}, CollisionAvoidanceLimit"
     return Row(name, ours, lambda: peer(next(theirs).q), reference, faster=1.0, check=check)
 
 
@@ -138,4 +184,9 @@ def contact_detection() -> Row:
     return Row("contact detection", step, mink_step(), f"{named('mink')}, step", cost=0.5, check=check)
 
 
-ROWS: tuple[Callable[[], Row], ...] = (tick_against_mink, tick_against_roboplan, contact_detection)
+ROWS: tuple[Callable[[], Row], ...] = (
+    tick_against_mink,
+    whole_tick_against_mink,
+    tick_against_roboplan,
+    contact_detection,
+)
