@@ -99,7 +99,7 @@ def _whole_tick(arm: ArmModel, keeper: SafetyFilter, scene: Scene, states: list[
 
 
 def whole_tick_against_mink() -> Row:
-    """A control tick with tracker, RCAMO and the safety filter among 5 moving obstacles, against mink's filter alone."""
+    """A control tick with tracker, RCAMO and safety filter among 5 moving obstacles, against mink alone."""
     arm, keeper, scene, states, target = _setup()
     peer, theirs = avoiding_mink(arm, scene, states, target), cycle(states)
     ours = _whole_tick(arm, keeper, _moving(scene), states)

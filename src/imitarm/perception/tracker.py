@@ -132,6 +132,7 @@ class ObstacleTracker:
         self._distances: deque[Array] = deque(maxlen=_RECENT)
         self._forgotten = False  # whether steps are no longer kept
         self._scene: Scene | None = None
+        self._shapes: tuple[object, ...] = ()  # of the obstacles in it
 
     @property
     def stamp(self) -> float | None:
@@ -202,24 +203,22 @@ class ObstacleTracker:
         time = finite_number(time, "ObstacleTracker.scene: time", "s")
         if not self._steps:
             return Scene(goal, (), time, tuple(fixtures))
-        base = self._scene
-        if base is None or base.goal is not goal or base.fixtures != tuple(fixtures):
+        tracks = self._steps[-1].tracks
+        rows = np.array([track.row for track in self.tracks], dtype=np.intp)
+        base, known = self._scene, self._shapes
+        shapes = tracks.shapes(rows)
+        if base is None or known != shapes or base.goal is not goal or base.fixtures != tuple(fixtures):
             obstacles = tuple(track.obstacle for track in self.tracks)
-            self._scene = base = Scene(goal, obstacles, self._steps[-1].stamp, tuple(fixtures))
+            self._scene = base = Scene(goal, obstacles, tracks.stamp, tuple(fixtures))
+            self._shapes = shapes
         if not len(base.packed):
             return replace(base, stamp=time)
-        tracks = self._steps[-1].tracks
-        rows = np.array([track.row for track in self.tracks])
         mean, covariance = tracks.filter.predict(tracks.belief.rows(rows), time - tracks.stamp).combined()
-        packed = base.packed
-        moved = packed.placed(
-            mean[:, :3],
-            turned_on(packed.quaternions, packed.angular_velocities, np.full(len(rows), time - tracks.stamp)),
-            mean[:, 3:6],
-            packed.angular_velocities,
-            tracks.last_seen[rows],
-            covariance[:, :3, :3],
-        )
+        last_seen, rates = tracks.last_seen[rows], tracks.reported_rates[rows]
+        rotations = turned_on(tracks.quaternions(rows), rates, time - last_seen)
+        position, velocity = np.ascontiguousarray(mean[:, :3]), np.ascontiguousarray(mean[:, 3:6])
+        uncertainty = np.ascontiguousarray(covariance[:, :3, :3])
+        moved = base.packed.placed(position, rotations, velocity, rates, last_seen, uncertainty)
         return Scene.predicted(base, moved, time)
 
     def _repeats(self, stamp: float, detections: tuple[Detection, ...]) -> bool:
@@ -236,7 +235,6 @@ class ObstacleTracker:
         before = self._steps[-1].tracks if self._steps else Tracks.none(self.filter, stamp)
         self._steps.append(self._advanced(before, stamp, detections))
         self._distances.append(self._steps[-1].distances)
-        self._scene = None
         while len(self._steps) > 1 and self._steps[1].stamp <= stamp - self.history:
             self._steps.popleft()
             self._forgotten = True

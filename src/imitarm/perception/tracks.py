@@ -121,6 +121,24 @@ class Tracks:
         """Mean (n, m) and covariance (n, m, m) of each obstacle's state, combined over all models of motion."""
         return self.belief.combined()
 
+    def shapes(self, rows: Indices) -> tuple[object, ...]:
+        """Return what does not change while tracks only move: number, name, shape and size of each of them."""
+        parts: list[object] = [self.sizes[rows].tobytes()]
+        for row, track_id in zip(rows.tolist(), self.ids[rows].tolist(), strict=True):
+            detection = self.detections[row]
+            parts += (
+                track_id,
+                self.labels[row],
+                detection.obstacle.name,
+                detection.solid.kind,
+                id(detection.solid.polytope),
+            )
+        return tuple(parts)
+
+    def quaternions(self, rows: Indices) -> Array:
+        """Return the rotations (k, 4) that were detected last."""
+        return np.array([self.detections[row].solid.quaternion for row in rows.tolist()]).reshape(-1, 4)
+
     @cached_property
     def reported_rates(self) -> Array:
         """Angular velocity of each obstacle, reduced by its uncertainty, shape (n, 3) [rad/s]."""

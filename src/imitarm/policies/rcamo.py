@@ -359,7 +359,7 @@ class RCAMO(Policy):
         if not covariances.any():
             return np.zeros((n, len(self.least_cost.times)))
         sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[:, -1], 0.0))
-        return np.broadcast_to(np.minimum(self._beta * sigma, self._cap)[:, None], (n, len(self.least_cost.times)))
+        return np.minimum(self._beta * sigma, self._cap)[:, None] * np.ones(len(self.least_cost.times))
 
     def _rotation(self, path: PrimitivePath, tool: Pose, phase: float, dt: float) -> Array:
         """Return the angular velocity that follows the learned rotation, shape (3,) [rad/s]."""
