@@ -19,7 +19,7 @@ typedef struct {
     int64_t H, S, C, d, R, m;
     const double *times, *A, *B, *gains, *weights, *task, *pull, *candidates, *one_sided, *rates, *waiting;
     const double *radii, *spheres;
-    double curvature, change_weight, weight, limit, clearance, width, influence, reach, largest_a, largest_b, rate_time;
+    double curvature, change_weight, weight, limit, clearance, width, influence, reach, largest_a, largest_b, rate_time, beta, cap;
 } LeastCost;
 
 /* The motion at n + 1 phases; rotations: of the tool at each of them, or one for all, or none (n_rotations). */
@@ -42,6 +42,7 @@ typedef struct {
     int64_t *order;          /* of the candidates, by smooth */
     double *centers, *gaps, *reduction, *costs;
     int64_t *arrived, *near;
+    double *margins; /* (n, H) */
 } Memory;
 
 static int64_t words(int64_t bytes) { return (bytes + 7) / 8; }
@@ -61,6 +62,7 @@ static int64_t lay_out(Memory *memory, const LeastCost *c, int64_t n, double *sc
     memory->costs = scratch, scratch += c->R * c->C;
     memory->arrived = (int64_t *)scratch, scratch += c->R * c->H;
     memory->near = (int64_t *)scratch, scratch += c->R * n * c->H * c->S;
+    memory->margins = scratch, scratch += n * c->H;
     return scratch - begin;
 }
 
@@ -79,6 +81,33 @@ static double cost_at(const LeastCost *c, double gap)
 {
     double exponent = (c->clearance - gap) / c->width;
     return exponent < -NO_COST ? 0.0 : exp(exponent < LARGEST_EXPONENT ? exponent : LARGEST_EXPONENT);
+}
+
+/* The largest eigenvalue of a symmetric matrix (3, 3). */
+static double largest_eigenvalue(const double *a)
+{
+    double mean = (a[0] + a[4] + a[8]) / 3.0, x = a[0] - mean, y = a[4] - mean, z = a[8] - mean;
+    double spread = x * x + y * y + z * z + 2.0 * (a[1] * a[1] + a[2] * a[2] + a[5] * a[5]);
+    double p = sqrt(spread / 6.0);
+    if (!(p > 0.0))
+        return mean;
+    double determinant = x * (y * z - a[5] * a[5]) - a[1] * (a[1] * z - a[5] * a[2]) + a[2] * (a[1] * a[5] - y * a[2]);
+    double cosine = determinant / (2.0 * p * p * p);
+    return mean + 2.0 * p * cos(acos(cosine < -1.0 ? -1.0 : cosine > 1.0 ? 1.0 : cosine) / 3.0);
+}
+
+/* The margins by the uncertainty of the observed positions; null if all are exact. */
+static const double *margins_of(Memory *memory, const Obstacles *obstacles, const LeastCost *c)
+{
+    int exact = 1;
+    for (int64_t i = 0; i < 9 * obstacles->n; i++)
+        exact = exact && obstacles->covariances[i] == 0.0;
+    for (int64_t i = 0; i < obstacles->n && !exact; i++) {
+        double margin = fmin(c->beta * sqrt(fmax(largest_eigenvalue(obstacles->covariances + 9 * i), 0.0)), c->cap);
+        for (int64_t m = 0; m < c->H; m++)
+            memory->margins[c->H * i + m] = margin;
+    }
+    return exact ? 0 : memory->margins;
 }
 
 /* Find the obstacles that may have an effect within the horizon; returns their number. */
@@ -333,7 +362,7 @@ static int64_t nearest_with(const Memory *memory, const LeastCost *c, const doub
     return nearest;
 }
 
-/* Choose; margins (n_obstacles, H), null for none. Out: u / a_max (3), speed of the phase, cost, distance of the nearest
+/* Choose; margins (n_obstacles, H), or null for those by the uncertainty of the obstacles' positions. Out: u / a_max (3), speed of the phase, cost, distance of the nearest
  * obstacle. Returns the nearest obstacle, or -1 if none is near: then nothing was chosen. */
 int64_t least_cost_choice(const Obstacles *obstacles, double dt, const LeastCost *c, const Path *path, const State *s,
                           const double *margins, double *scratch, double *out)
@@ -341,6 +370,7 @@ int64_t least_cost_choice(const Obstacles *obstacles, double dt, const LeastCost
     Memory memory;
     Best best = {0, 0, INFINITY};
     lay_out(&memory, c, obstacles->n, scratch);
+    margins = margins ? margins : margins_of(&memory, obstacles, c);
     int64_t n = find_near(&memory, obstacles, dt, c, path, s, margins);
     if (!n)
         return -1;

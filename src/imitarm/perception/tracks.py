@@ -152,6 +152,9 @@ class Tracks:
     @cached_property
     def view(self) -> tuple[TrackedObstacle, ...]:
         """The confirmed tracks, in the order of their numbers."""
+        numbers = self.ids.tolist()
+        if numbers == sorted(numbers) and (not numbers or numbers[0] != UNCONFIRMED):  # the usual case
+            return tuple([TrackedObstacle(self, row) for row in range(len(numbers))])
         rows = self.confirmed
         return tuple([TrackedObstacle(self, row) for row in rows[self.ids[rows].argsort()].tolist()])
 
@@ -262,7 +265,7 @@ class TrackedObstacle:
 
 def smoothed_sizes(sizes: Array, rows: Indices, measured: Array, counts: NDArray[np.int64]) -> Array:
     """Return the averaged sizes (n, 3) [m] of all tracks after new measurements (k, 3) [m] of the tracks ``rows``."""
-    error = measured - sizes[rows]
+    error = measured - (sizes if len(rows) == len(sizes) else sizes[rows])  # all rows are in order
     if not error.any():
         return sizes
     smoothed = sizes.copy()

@@ -203,7 +203,8 @@ class RCAMO(Policy):
     @cached_property
     def _record(self) -> Record:
         """The C structure ``LeastCost``."""
-        return self.least_cost.record(self._spheres, self._one_sided, self._tool_radius, _RATE_TIME)
+        given = self._spheres, self._one_sided, self._tool_radius, _RATE_TIME, self._beta, self._cap
+        return self.least_cost.record(*given)
 
     # ----- each step
 
@@ -275,7 +276,7 @@ class RCAMO(Policy):
             self._room_for = len(packed)
             self._room = np.empty(kernel.least_cost_scratch(constants, len(packed)))
         elapsed, state, margins = observation.time - observation.scene.stamp, self._state, None
-        if self._margin is not None or packed.covariances.any():
+        if self._margin is not None:
             margins = np.ascontiguousarray(self._margins(packed.covariances, elapsed))
         axes = frame(path.tangent(self._phase), self._axes)
         state[:3], state[3:6], state[6:12] = observation.tool_to_base.position, lag, self._deviation.ravel()
