@@ -278,9 +278,12 @@ class ObstacleTracker:
         else:
             belief, pairs = compiled
             if len(pairs.tracks) == len(tracks) == len(detections) and tracks.all_confirmed:
-                seen = self._all_seen(tracks.changed(stamp=stamp, belief=belief), pairs, detections, table)
-                if seen is not None:
-                    return _Step(stamp, given, seen, pairs.distances)
+                ordered = tuple([detections[i] for i in pairs.detections.tolist()])
+                if tracks.alike(ordered):
+                    now = tracks.changed(stamp=stamp, belief=belief)
+                    rates = self._turned(now, pairs, detections)
+                    now = now.all_seen(ordered, table[pairs.detections, 12:], rates, self.confirm[1])
+                    return _Step(stamp, given, now, pairs.distances)
             measured = Measurements(table[:, :3], table[:, 3:12].reshape(-1, 3, 3))
         tracks = self._seen(tracks.changed(stamp=stamp, belief=belief), pairs, detections, table[:, 12:])
         tracks = self._pruned(tracks)
@@ -375,25 +378,6 @@ class ObstacleTracker:
             detections=tuple(seen),
             labels=tuple(labels),
         )
-
-    def _all_seen(self, tracks: Tracks, pairs: Pairs, detections: tuple[Detection, ...], table: Array) -> Tracks | None:
-        """Return :meth:`_seen` for confirmed tracks that all have a detection; None if a label or a kind is new."""
-        seen = tuple([detections[i] for i in pairs.detections.tolist()])
-        for track, detection in zip(tracks.detections, seen, strict=True):
-            if detection.label or detection.solid.kind != track.solid.kind:
-                return None
-        counts = tracks.counts + 1
-        tracks = tracks.changed(
-            hits=(tracks.hits << 1 & (1 << self.confirm[1]) - 1) | 1,
-            ages=tracks.ages + 1,
-            last_seen=np.full(len(seen), tracks.stamp),
-            sizes=smoothed_sizes(tracks.sizes, pairs.tracks, table[pairs.detections, 12:], counts),
-            counts=counts,
-            rates=self._turned(tracks, pairs, detections),
-            detections=seen,
-        )
-        tracks.__dict__["all_confirmed"] = True
-        return tracks
 
     def _turned(self, tracks: Tracks, pairs: Pairs, detections: tuple[Detection, ...]) -> Rates:
         """Return the angular velocities after the assigned detections."""

@@ -121,6 +121,34 @@ class Tracks:
         """Mean (n, m) and covariance (n, m, m) of each obstacle's state, combined over all models of motion."""
         return self.belief.combined()
 
+    def alike(self, detections: tuple[Detection, ...]) -> bool:
+        """Whether each track has its shape and no label in ``detections``, which are in the order of the tracks."""
+        return not any(
+            d.label or d.solid.kind != t.solid.kind for d, t in zip(detections, self.detections, strict=True)
+        )
+
+    def all_seen(self, detections: tuple[Detection, ...], sizes: Array, rates: Rates, window: int) -> Tracks:
+        """Return confirmed tracks after a detection of each of them; see :meth:`alike`.
+
+        Args:
+            detections: in the order of the tracks.
+            sizes: measured sizes, shape (n, 3) [m].
+            rates: new angular velocities.
+            window: number of updates that ``hits`` remembers.
+        """
+        counts = self.counts + 1
+        seen = self.changed(
+            hits=(self.hits << 1 & (1 << window) - 1) | 1,
+            ages=self.ages + 1,
+            last_seen=np.full(len(counts), self.stamp),
+            sizes=smoothed_sizes(self.sizes, np.arange(len(counts)), sizes, counts),
+            counts=counts,
+            rates=rates,
+            detections=detections,
+        )
+        seen.__dict__["all_confirmed"] = True
+        return seen
+
     def shapes(self, rows: Indices) -> tuple[object, ...]:
         """Return what does not change while tracks only move: number, name, shape and size of each of them."""
         parts: list[object] = [self.sizes[rows].tobytes()]

@@ -195,18 +195,14 @@ class LeastCost:
         """The cost of each speed, shape (R,)."""
         return np.array([self.wait_weight * (1.0 - rate) ** 2 for rate in self.rates])
 
-    def record(
-        self, spheres: Array, one_sided: Array, tool_radius: float, rate_time: float, beta: float, cap: float
-    ) -> Record:
+    def record(self, spheres: Array, one_sided: Array, tool_radius: float, *numbers: float) -> Record:
         """Return the C structure ``LeastCost``; the obstacle cost must be a :class:`DistanceCost`.
 
         Args:
             spheres: centres of the tool's spheres relative to its tip, shape (S, 3) [m].
-            one_sided: directions in which u must have no component, shape (m, 3).
+            one_sided: directions along which u must have no positive component, shape (m, 3).
             tool_radius: largest distance of the tool's surface from its tip [m].
-            rate_time: time in which the phase takes up another speed [s].
-            beta: margin of an obstacle, in standard deviations of its position.
-            cap: largest margin [m].
+            numbers: the last fields: ``rate_time`` [s], ``beta``, ``cap`` [m].
         """
         cost, response, (task, pull, curvature) = self.obstacle_cost, self.response, self._task
         assert isinstance(cost, DistanceCost)
@@ -228,9 +224,7 @@ class LeastCost:
             tool_radius + self.travel + influence,
             float(np.abs(response.A - 1.0).max()),
             float(np.abs(response.B).max()),
-            rate_time,
-            beta,
-            cap,
+            *numbers,
         )
 
     @property
