@@ -291,7 +291,7 @@ def test_the_causal_oracle_finds_the_cheapest_chain_of_cells(dimension):
 
 def total_of(chain, costs, grid):
     steps = np.diff(grid.deviations[chain], axis=0)
-    return costs[np.arange(1, len(chain)), chain[1:]].sum() + 0.3 * np.sum(steps * steps)
+    return costs[np.arange(1, len(chain)), chain[1:]].sum() + 2.0 * np.sum(steps * steps)
 
 
 def random_chain(rng, middle, grid):

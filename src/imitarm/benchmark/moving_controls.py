@@ -55,9 +55,11 @@ _AGAIN = 0.1  # [s] between two searches
 _APART = {2: 0.025, 3: 0.04}  # [m] between two deviations
 _BESIDE_IT = {2: 16, 3: 9}  # deviations to each side of the learned motion
 _STEPS = {2: 3, 3: 2}  # deviations that the tool may move between two layers
-_WANTED, _GROWTH = 0.045, 0.05  # [m], [m/s] wanted gap, which grows with the look-ahead
-_NEAR_COST = 100.0  # of the squared lack of gap, relative to the squared distance from the learned motion
+_WANTED, _GROWTH = 0.045, 0.1  # [m], [m/s] wanted gap, which grows with the look-ahead
+_LOCAL_STEP_COST = 2.0  # of the squared length of a step, relative to the squared distance from the learned motion
+_NEAR_COST = 400.0  # of the squared lack of gap, relative to the squared distance from the learned motion
 _TOUCHING, _TOUCH_COST = 0.008, 10.0  # [m], [m^2]
+_INERTIA = 3.0  # of the squared distance from the motion at the present velocity, in the first two layers
 _LOCAL_BLUR = 0.8  # layers: standard deviation of the filter that smooths a chain of deviations
 _AHEAD = 0.97  # of the longest duration, for the arrival
 
@@ -305,7 +307,7 @@ def cheapest(costs: Array, begin: int, grid: Cells) -> Indices:
     came = np.empty((len(costs), n), dtype=np.intp)
     every = np.arange(n)
     for k in range(1, len(costs)):
-        through = total[grid.before] + _STEP_COST * grid.lengths
+        through = total[grid.before] + _LOCAL_STEP_COST * grid.lengths
         best = through.argmin(axis=1)
         came[k] = grid.before[every, best]
         total[:n] = through[every, best] + costs[k]
@@ -337,6 +339,7 @@ class CausalOracle(Policy):
     def reset(self, observation: Observation) -> None:
         """Begin the motion."""
         self._motion, self._searched = self._nominal, -np.inf
+        self._before = observation.time, observation.tool_to_base.position
 
     def step(self, observation: Observation, dt: float) -> Command:
         """Return the velocity that follows the motion found last."""
@@ -344,7 +347,10 @@ class CausalOracle(Policy):
         time, x = observation.time, observation.tool_to_base.position
         if time - self._searched >= _AGAIN - 1e-9:
             self._searched = time
-            self._motion = self._found(observation.scene, time, x)
+            before, place = self._before
+            velocity = (x - place) / (time - before) if time > before else np.zeros(3)
+            self._motion = self._found(observation.scene, time, x, velocity)
+        self._before = time, x
         return _follow(self._motion, time, x)
 
     def finished(self, observation: Observation) -> bool:
@@ -352,7 +358,7 @@ class CausalOracle(Policy):
         away = np.linalg.norm(observation.tool_to_base.position - self._nominal.positions[-1])
         return bool(observation.time >= self._nominal.times[-1] and away < _ARRIVED)
 
-    def _found(self, scene: Scene, time: float, x: Array) -> Trajectory:
+    def _found(self, scene: Scene, time: float, x: Array, velocity: Array) -> Trajectory:
         times: Array = time + LAYER * np.arange(_LAYERS + 1.0)
         targets = self._nominal.at(np.minimum(times, self._nominal.times[-1]))[0]
         deviations = self._cells.deviations
@@ -365,6 +371,9 @@ class CausalOracle(Policy):
             gap = gaps.min(axis=0, initial=np.inf)
             lack = np.maximum(_WANTED + _GROWTH * (at - time) - gap, 0.0)
             costs[k] = away + _NEAR_COST * lack * lack + np.where(gap < _TOUCHING, _TOUCH_COST * (1.0 + lack), 0.0)
+        for k in (1, 2):  # the tool goes on as it moves now, if nothing is in the way
+            onwards = x + k * LAYER * velocity - targets[k]
+            costs[k] += _INERTIA * np.sum((deviations - onwards) ** 2, axis=1)
         chain = deviations[cheapest(costs, begin, self._cells)]
         chain[0] = first
         ahead = np.concatenate([np.repeat(chain[:1], 4, axis=0), chain])
