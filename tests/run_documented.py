@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-BLOCK = re.compile(r"^```(?:sh|bash|console)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"^```(?:sh|bash|console|)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 COMMAND = re.compile(r"(?:\w+=\S+ )*(?:\.venv/bin/)?(?:imitarm|python|make|pip) ")
 BEFORE = {
     "retargeting.md": [
@@ -38,7 +38,8 @@ BEFORE = {
 }
 """Commands of other pages whose files a page uses."""
 TOGETHER = {"transmission.md"}  # pages whose commands run at the same time, each in its own terminal
-SKIPPED = re.compile(r"make (demo|test|quick|mediapipe|install)\b|pip install")  # they install packages
+SKIPPED = re.compile(r"make (demo|test|quick|mediapipe|install)\b|pip install|imitarm teleoperate udp:")
+"""Commands that install packages, or that ask a person at a terminal to enable the robot."""
 
 SCENE = """\
 format: imitarm-scene
@@ -109,7 +110,7 @@ def run(together: list[str], folder: Path, environment: dict[str, str], seconds:
             )
     for process, output in zip(processes, outputs, strict=True):
         if process is None:
-            yield "skipped", "installs packages, or needs the videos of 'make mediapipe'"
+            yield "skipped", "installs packages, asks a person, or needs the videos of 'make mediapipe'"
             continue
         status = ended(process, began + seconds)
         lines = [line.strip() for line in output.read_text(encoding="utf-8", errors="replace").split("\n")]
