@@ -21,7 +21,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-BLOCK = re.compile(r"^```(?:sh|bash|console|)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
+SHELLS = ("", "sh", "bash", "console")  # languages of blocks with commands
 COMMAND = re.compile(r"(?:\w+=\S+ )*(?:\.venv/bin/)?(?:imitarm|python|make|pip) ")
 BEFORE = {
     "retargeting.md": [
@@ -58,7 +59,8 @@ PAIRS = [(0.1, 0.2, 2.0), (0.4, -0.1, 2.1), (-0.2, 0.3, 1.8), (0.0, -0.3, 2.4), 
 
 def commands(page: Path) -> Iterator[str]:
     """Yield the commands in the code blocks of ``page``, without their comments."""
-    for block in BLOCK.findall(page.read_text(encoding="utf-8")):
+    blocks = BLOCK.findall(page.read_text(encoding="utf-8"))
+    for block in (text for language, text in blocks if language in SHELLS):
         for line in block.replace("\\\n", " ").splitlines():
             command = re.sub(r"\s+#.*", "", " ".join(line.split()))
             if COMMAND.match(command):
