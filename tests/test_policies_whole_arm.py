@@ -239,7 +239,7 @@ def test_arguments_that_do_not_go_together_are_refused(real_data):
         adapt(skill, Scene(), tool_radius=0.01, state=at_rest(start))
     with pytest.raises(InputError, match="max_tilt"):
         adapt(skill, Scene(), arm=arm, state=at_rest(start), max_tilt=-1.0)
-    with pytest.raises(InputError, match="decompose it with that start"):
+    with pytest.raises(InputError, match="with the tool's pose as its start"):
         adapt(ComponentPath.of_skill(skill), Scene(), arm=arm, state=at_rest(start + 0.1))
 
 

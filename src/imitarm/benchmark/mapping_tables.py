@@ -239,7 +239,10 @@ def torque_table(results: Results, tasks: Sequence[str], name: str, title: str) 
 
 
 def limits_table(results: Results, tasks: Sequence[str]) -> Table:
-    """Return a table of frames that exceed limits, computed by finite differences of the joint positions."""
+    """Return a table of the frames in which a joint exceeds a limit.
+
+    Velocities and accelerations are finite differences of the joint positions.
+    """
     rows = []
     for name in results.methods:
         made = [r for r in results.of(name, tasks) if not r.without_recording]

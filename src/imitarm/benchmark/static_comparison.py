@@ -209,7 +209,8 @@ def printed_table(results: StaticResults) -> Table:
         "Printed values: thesis Table 4.1, which states no unit, no number of failures and no spread; the printed "
         "average of DMP+ANN is 0.224, ten times the mean of its column. Ours: mean RMSE of the successes [m], and in "
         "brackets the number of scenes in which the method succeeded. In each scene, the obstacles of the task are "
-        "moved a little. Where a method fails, its mean is over fewer scenes than those of the other methods."
+        "moved a little. The mean of a method that fails in some scenes is over fewer "
+        "scenes than the means of the other methods."
     )
     return Table(
         "Table 4.1 of the thesis, and ours: RMSE", ("method", *(f"{t}>" for t in tasks), "average>"), tuple(rows), note

@@ -177,7 +177,10 @@ def obstacles_chart(results: StaticResults) -> str:
 
 
 def tasks_chart(results: StaticResults, name: str, unit: str) -> str:
-    """Draw a time for each task T1 to T8, one line for each method; computing times have a logarithmic scale."""
+    """Draw the time called ``name`` for each task T1 to T8, with one line for each method.
+
+    Computing times have a logarithmic scale.
+    """
     found = times_by_task(results, name)
     if not found:
         return ""

@@ -414,5 +414,5 @@ def obstacles_table(results: StaticResults) -> Table:
         "Success by the number of obstacles, % (95 %)",
         ("method", *(f"{n}>" for n in numbers)),
         tuple(rows),
-        "Scenes of all families that have a solution.",
+        "All scenes that have a solution, of all families.",
     )

@@ -170,7 +170,7 @@ def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
     If condition 1 holds, the whole body is swapped back before conditions 2 and 3 are tested. A joint is used only if
     it is visible now and both joints of its pair were visible in the previous frame. If only one joint of a pair is
     used, :math:`g_j` contains only the terms of this joint, and the threshold of the pair is halved. If neither joint
-    of a pair can be used, condition 1 leaves the pair out, and a condition 2 or 3 that needs the pair does not hold.
+    of a pair can be used, condition 1 leaves the pair out. Condition 2 or 3 does not hold if it needs this pair.
     Hands that touch are too close to each other to satisfy a condition, so they are not swapped.
 
     Args:

@@ -1,4 +1,4 @@
-"""Data that tasks, limits and methods of the inverse kinematics exchange."""
+"""Data that the tasks, the limits and the methods of inverse kinematics pass to each other."""
 
 from __future__ import annotations
 

@@ -260,7 +260,8 @@ def _check_start(path: ComponentPath, begins: Pose) -> None:
     away = float(np.linalg.norm(path.nominal.positions[0] - begins.position))
     if away > _SAME_START:
         raise InputError(
-            f"adapt: the decomposed path starts {1e3 * away:.1f} mm from the arm's tool; decompose it with that start"
+            f"adapt: the decomposed path starts {1e3 * away:.1f} mm from the arm's tool; decompose it again, "
+            "with the tool's pose as its start"
         )
 
 

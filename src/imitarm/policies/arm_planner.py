@@ -86,7 +86,7 @@ class ArmPlan:
     Attributes:
         components: the learned path and its components, before they were displaced.
         displacement: displacement of each component's mean, shape (n_components, 3) [m].
-        tilts: the rotations of the tool away from the learned rotation that the plan can choose from.
+        tilts: rotations that the plan can choose from, each relative to the learned rotation of the tool.
         tilt: the chosen coefficients of ``tilts``, shape (n_tilts, 3) [rad].
         path: the arm at the samples.
         clearance: the smallest clearance and its place on the path. If its room is at least 0 and ``complete`` is True,

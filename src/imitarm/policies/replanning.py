@@ -60,8 +60,8 @@ def replan(
         scene: obstacles now; its goal is None, or the goal of ``previous``.
         arm: the arm with its tool.
         state: measured state of the arm.
-        phase: time that has passed since the approach of ``previous`` ended [s]; it is a time of
-            ``previous.trajectory``.
+        phase: present time on the clock of ``previous.trajectory`` [s]. This clock starts at 0 when the approach, the
+            motion to the start of the path, has ended.
         clearance: required distance from the whole arm to every obstacle [m].
         forbidden: directions in which no component may move, shape (m, 3); see :func:`adapt`.
         max_tilt: largest rotation of the tool away from the learned rotation [rad]; see :func:`adapt`.

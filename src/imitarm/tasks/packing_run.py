@@ -101,8 +101,8 @@ def run_packing(
     Args:
         task: the task.
         arm: the arm, if it has been loaded already.
-        observer: function that returns the ``observe`` of :func:`~imitarm.control_loop.reproduce` for the task and its
-            simulated robot, see :data:`OBSERVERS`; None: :func:`sensed`.
+        observer: function that takes the task and its simulated robot, and returns the argument ``observe`` of
+            :func:`~imitarm.control_loop.reproduce`; see :data:`OBSERVERS`. None: :func:`sensed`.
         on_step: function called after each control step.
 
     Returns:
