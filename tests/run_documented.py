@@ -25,6 +25,7 @@ BLOCK = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
 SHELLS = ("", "sh", "bash", "console")  # languages of blocks with commands
 COMMAND = re.compile(r"(?:\w+=\S+ )*(?:\.venv/bin/)?(?:imitarm|python|make|pip) ")
 BEFORE = {
+    "perception.md": ["imitarm learn pouring.npy --units cm --duration 10 --task pour --out pour.json"],
     "retargeting.md": [
         "imitarm capture synthetic:7 --seconds 20 --out wave.csv",
         "imitarm calibrate limbs wave.csv",
@@ -35,7 +36,7 @@ BEFORE = {
             f"--tool gripper --fit --out wave_{i}.csv"
             for i in (1, 2, 3)
         ),
-    ]
+    ],
 }
 """Commands of other pages whose files a page uses."""
 TOGETHER = {"transmission.md"}  # pages whose commands run at the same time, each in its own terminal
