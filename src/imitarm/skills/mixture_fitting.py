@@ -353,7 +353,7 @@ def try_numbers_of_components(
         tables: samples [t, x, y, z, ...] of each demonstration, over the same span of time.
         numbers: numbers K of components to try.
         min_std: smallest standard deviation with which each column counts as moving, in the column's unit.
-        reg_covar: smallest eigenvalue of a covariance relative to the variances of the columns.
+        reg_covar: lower bound of the eigenvalues of a covariance, relative to the variances of the columns.
         more: further numbers, which are tried in this order as long as every bias is above 1 % of the motion's extent,
             or every learned path is shorter than 95 % of the motion.
 

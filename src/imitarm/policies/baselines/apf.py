@@ -51,7 +51,7 @@ class APF(BaselinePolicy):
         influence: d_0 [m].
         cap: rho_c [m].
         speed: speed of the tool far from the goal and from obstacles, divided by the mean speed of the learned motion.
-            The gain ``eta`` of the attraction is the tool's speed there, divided by ``cap``.
+            The gain ``eta`` of the attraction is this speed of the tool [m/s], divided by ``cap``.
         options: arguments of :class:`~imitarm.policies.path_policy.PathPolicy`.
     """
 
