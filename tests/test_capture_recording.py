@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -250,13 +250,19 @@ def test_it_replays_once_and_again_after_rewind():
     assert len(list(recording)) == 4
 
 
-def test_in_real_time_a_frame_comes_when_it_is_due():
+def test_in_real_time_a_frame_comes_when_it_is_due(monkeypatch):
+    now = [100.0]
+
+    def sleep(seconds):
+        now[0] += seconds
+
+    monkeypatch.setattr("imitarm.capture.recording.clock", SimpleNamespace(monotonic=lambda: now[0], sleep=sleep))
     recording = SkeletonRecording(skeletons(7, rate=30.0), realtime=True)
     assert recording.read() is not None
-    began = time.monotonic()
     assert recording.read(timeout=0.0) is None  # not yet
+    assert recording.read(timeout=0.02) is None and now[0] == pytest.approx(100.02)
     assert len(list(recording)) == 6
-    assert time.monotonic() - began > 0.19
+    assert now[0] == pytest.approx(100.2)
 
 
 def test_nothing_can_be_saved_of_nothing(tmp_path):
