@@ -82,7 +82,7 @@ def prepare(folder: Path, data: Path, environment: dict[str, str]) -> None:
     (folder / "pairs.csv").write_text("\n".join([names, *rows, ""]), encoding="utf-8")
     if not data.exists():
         return
-    (folder / "recordings").symlink_to(data / "panda_kinesthetic")
+    (folder / "recordings").symlink_to(data)
     for name in ("pouring", "letter_h", "bottle2shelf", "letter_e"):
         shutil.copy(data / "panda_kinesthetic" / f"{name}.npy", folder)
         if name == "pouring":
