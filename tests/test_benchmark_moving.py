@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from imitarm import cli
-from imitarm.benchmark.moving import OURS, MovingExperiment, build, default_methods, method_names
+from imitarm.benchmark.arm_oracle import ArmOracle
+from imitarm.benchmark.moving import OURS, MovingExperiment, MovingResult, build, default_methods, method_names
 from imitarm.benchmark.moving_arm import arm_case, prepared
 from imitarm.benchmark.moving_controls import Grid, cells, cheapest, search
 from imitarm.benchmark.moving_measures import Contact, contacts, limits_kept, measured, tracking
@@ -23,8 +24,10 @@ from imitarm.benchmark.static_measures import LATEST, MAX_ACCELERATION, MAX_SPEE
 from imitarm.benchmark.static_scenes import learned_skill
 from imitarm.benchmark.tables import END
 from imitarm.command import Status
-from imitarm.errors import InputError, UnknownNameError
+from imitarm.errors import InfeasibleError, InputError, UnknownNameError
+from imitarm.kinematics.arm import ArmState
 from imitarm.kinematics.pose import Pose
+from imitarm.policies.policy import Observation
 from imitarm.scene import Box, MovingScene, Scene, Sphere
 
 SYNTHETIC = tuple(family for family in FAMILIES if family != "M10")
@@ -341,12 +344,33 @@ def test_no_obstacle_passes_through_the_base_of_an_arm():
             assert gap.min() > 0.9 * case.clearance, seed
 
 
+def test_the_oracle_of_an_arm_finds_a_way_that_is_free_in_space_and_time():
+    case = arm_case("panda", "M1", 1001)
+    oracle = build("oracle-future", case, (), "panda")
+    skill, arm, start = prepared("panda")
+    state = ArmState(start, np.zeros(7), np.zeros(7), 0.0)
+    observation = Observation(0.0, state, arm.tool_pose(start), case.truth.at(0.0))
+    oracle.reset(observation)
+    longest, least = np.zeros(7), np.inf
+    for time in np.arange(0.0, 1.94 * skill.duration_, 0.05):
+        q, later = oracle._at(time), oracle._at(time + 0.05)
+        longest = np.maximum(longest, np.abs(later - q) / 0.05)
+        centers, radii = arm.collision_spheres(q)
+        least = min(least, *(float((o.signed_distance(centers) - radii).min()) for o in case.truth.at(time).obstacles))
+    assert least > 0.0 and (longest <= arm.max_velocity).all()
+    assert np.linalg.norm(arm.tool_pose(q).position - skill.goal_.position) < 1e-3
+    everywhere = MovingScene(Scene(None, [Sphere(skill.nominal([0.0, 5.0]).positions[-1], 0.4)]), {})
+    blocked = ArmOracle(skill, everywhere, start, tracked=False, arm=arm)
+    with pytest.raises(InfeasibleError, match="no motion"):
+        blocked.reset(observation)
+
+
 def test_worlds_are_checked():
     with pytest.raises(UnknownNameError):
         MovingExperiment("M1", 3, 0, world="moon")
     with pytest.raises(InputError, match="needs dimension 3"):
         MovingExperiment("M1", 2, 0, world="sawyer")
-    for method, world in (("oracle-future", "sawyer"), ("rcamo-certified", "tool"), ("rrt-connect", "tool")):
+    for method, world in (("aims-at-obstacle", "sawyer"), ("rcamo-certified", "tool"), ("rrt-connect", "tool")):
         with pytest.raises(UnknownNameError, match="method in the world"):
             MovingExperiment("M1", 3, 0, method, world=world)
 
@@ -383,6 +407,16 @@ def test_the_command_runs_resumes_and_compares(tmp_path, capsys):
     for said in ("Success among moving obstacles", "Fig 5.7", "Fig 5.11", "Claims of the thesis", "Tracked obstacles"):
         assert said in printed and said in document.read_text()
     assert str(tmp_path) not in document.read_text()
+
+
+def test_results_with_an_arm_have_a_place_of_their_own(tmp_path, capsys):
+    result = MovingResult(MovingExperiment("M1", 3, 2000, "rcamo", world="sawyer"), "commit 1", "success", "", {})
+    (tmp_path / "rcamo.jsonl").write_text(RESULTS.line(result) + "\n")
+    document, places = tmp_path / "doc.md", ("moving", "moving (whole arm)")
+    document.write_text("".join(f"<!-- imitarm benchmark {place} -->\n{END}\n" for place in places))
+    assert cli.main(["benchmark", "moving", "compare", str(tmp_path), "--fill", str(document)]) == 0
+    tool, arm = document.read_text().split("<!-- imitarm benchmark moving (whole arm) -->")
+    assert "rcamo" not in tool and "sawyer: Success" in arm and "filled" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from imitarm.benchmark.arm_oracle import ORACLES, ArmOracle
 from imitarm.benchmark.moving_arm import ROBOTS, arm_case, prepared, run_arm
 from imitarm.benchmark.moving_controls import CONTROLS, control
 from imitarm.benchmark.moving_measures import OUTCOMES, SUCCESSES, measured
@@ -39,7 +40,7 @@ def method_names(world: str = "tool") -> tuple[str, ...]:
     """Return the names of all methods in a world: the controls, and the policies that can run in this world."""
     if world == "tool":
         return (*CONTROLS, *(name for name in POLICIES if name not in _PLAN_JOINTS))
-    return (CONTROLS[0], *POLICIES)
+    return (CONTROLS[0], *ORACLES, *POLICIES)
 
 
 def default_methods(world: str = "tool") -> tuple[str, ...]:
@@ -67,6 +68,8 @@ def build(method: str, case: MovingCase, options: Options = (), world: str = "to
     if world != "tool":
         arm = prepared(world)[1]
         known.update(arm=arm, tool_spheres=arm.tool_spheres)
+        if method in ORACLES:
+            return ArmOracle(case.skill, case.truth, prepared(world)[2], tracked=method == ORACLES[1], **known)
     if method in CONTROLS:
         return control(method, case, **known)
     return POLICIES[method].build(case.skill, **known)

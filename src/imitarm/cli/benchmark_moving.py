@@ -22,6 +22,7 @@ from imitarm.errors import InputError
 
 _FOLDER = Path("benchmark-moving")
 _RECORDED = "M10"
+_WITH_ARM = "moving (whole arm)"  # in a document, the place of results that are all with an arm
 
 
 def add_moving(parsers: Any) -> None:
@@ -135,10 +136,10 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _compare(arguments: argparse.Namespace) -> int:
     """Print the tables of saved results, and write files."""
-    place = place_of(arguments, "moving")
     check_outputs([("--report", arguments.report)], [("--fill", arguments.fill)], new_folders=True)
     found = RESULTS.read_folders(arguments.folders)
     results, versions = MovingResults(found), [r.code for r in found]
+    place = place_of(arguments, "moving" if "tool" in results.worlds else _WITH_ARM)
     if set(versions) != {code_version()}:
         remark(origin(versions))
     report_tables(moving_tables(results), place, versions)
