@@ -1,8 +1,9 @@
 """Oracles for a whole arm among moving obstacles: a search over postures and time.
 
 The tool may be at any place of a grid. The grid extends along the learned path, to its sides and upwards. The arm has
-one posture for each place. In each layer of time, the arm may stay or move to a neighbouring place. The search finds the
-motion of least cost on which all links keep a margin from every obstacle. It shares no code with the compared methods.
+one posture for each place. In each layer of time, the arm may stay or move to a neighbouring place. The search finds
+the motion of least cost on which all links keep a margin from every obstacle. It shares no code with the compared
+methods.
 
 * ``oracle-future`` knows the true motion of all obstacles. If it finds no motion, the scene may have no solution.
 * ``oracle-tracks`` knows only the tracked obstacles, like the compared methods, and searches again every 0.3 s.
