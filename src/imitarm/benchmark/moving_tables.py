@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from imitarm.benchmark.arm_oracle import ORACLES
 from imitarm.benchmark.moving import OURS, MovingResult
 from imitarm.benchmark.moving_controls import CONTROLS
 from imitarm.benchmark.moving_measures import OUTCOMES, limits_kept
@@ -30,7 +31,7 @@ READINGS = {
 }
 """For each method in Figs 5.7 and 5.11 of the thesis, the methods of this library that stand for it."""
 _LISTED = 12  # contacts in a table
-_FORESEEN, _CAUSAL = "oracle-future", "oracle-tracks"
+_FORESEEN, _CAUSAL = ORACLES
 
 
 def moving_tables(results: MovingResults) -> list[Table]:
