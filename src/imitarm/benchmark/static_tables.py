@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from imitarm.benchmark.controls import CONTROLS
 from imitarm.benchmark.static import StaticExperiment, StaticResult
-from imitarm.benchmark.static_measures import MAX_ACCELERATION, MAX_SPEED, NEAR, SUCCESSES
+from imitarm.benchmark.static_measures import AT_GOAL, MAX_ACCELERATION, MAX_SPEED, NEAR, SLACK, SUCCESSES
 from imitarm.benchmark.static_tuning import tuned_options
 from imitarm.benchmark.tables import Table
 from imitarm.evaluation.intervals import wilson_interval
@@ -28,6 +28,12 @@ ORACLE = "oracle"
 POSSIBLE, IMPOSSIBLE, UNDECIDED = "possible", "impossible", "undecided"
 TASKS_FAMILY, N_TASKS = "S7", 8
 """The family of the sweeping tasks T1 to T8, and the number of tasks. The seed s gives the task T(1 + s modulo 8)."""
+
+
+def _largest_miss(result: StaticResult) -> float:
+    """Return the largest distance of a path from its start, its goal and its contact point [m]; NaN counts as 0."""
+    names = ("start_error", "goal_error", "contact_error")
+    return max((e for name in names if not math.isnan(e := result.value(name))), default=0.0)
 
 
 def row_name(experiment: StaticExperiment) -> str:
@@ -83,9 +89,18 @@ class StaticResults:
                 found[scene] = POSSIBLE if solved else UNDECIDED
         return found
 
-    def contradictions(self) -> list[StaticResult]:
-        """Return results that contradict the oracle: they keep the clearance, but it proved that no path can."""
-        return [r for r in self.all if r.outcome == "success" and self.answers[r.experiment.scene] == IMPOSSIBLE]
+    def beyond_proof(self, *, exact: bool) -> list[StaticResult]:
+        """Return the successes in scenes in which the oracle proves that no path keeps the clearance.
+
+        The proof holds for paths that pass exactly through start, goal and contact point. A success may miss them by up
+        to 5 mm, so only a success that passes through them contradicts the oracle.
+
+        Args:
+            exact: True for the successes that pass through all these points, and so contradict the oracle; False for
+                the other successes.
+        """
+        found = [r for r in self.all if r.outcome == "success" and self.answers[r.experiment.scene] == IMPOSSIBLE]
+        return [r for r in found if exact == (_largest_miss(r) <= SLACK)]
 
     def families(self) -> list[tuple[str, int]]:
         """Return the families with their dimensions."""
@@ -161,14 +176,25 @@ def scenes_table(results: StaticResults) -> Table:
             for s, rows_ in zip(scenes, mixed, strict=True)
         )
         rows.append((place(family), *map(str, (len(scenes), *counts, others))))
-    wrong = [
-        f"{row_name(r.experiment)} in {place(r.experiment.scene[:2])}, seed {r.experiment.seed}"
-        for r in results.contradictions()
-    ]
+    wrong, missing = (
+        [
+            f"{row_name(r.experiment)} in {place(r.experiment.scene[:2])}, seed {r.experiment.seed}"
+            for r in results.beyond_proof(exact=exact)
+        ]
+        for exact in (True, False)
+    )
     checked = sum(ORACLE in rows_ for rows_ in results.by_scene.values())
-    verdict = "No method keeps the clearance in a scene that the oracle proves impossible."
+    verdict = (
+        "In scenes that the oracle proves impossible, no path through the exact start, goal and contact point keeps the "
+        "clearance."
+    )
     if wrong:
         verdict = f"The oracle is wrong. A method solves a scene that the oracle calls impossible: {'; '.join(wrong)}."
+    if missing:
+        verdict += (
+            " A path that misses these points by up to "
+            f"{1e3 * AT_GOAL:.0f} mm counts as success, and keeps the clearance in such a scene: {'; '.join(missing)}."
+        )
     note = (
         f"The oracle was run in {checked} of {len(results.by_scene)} scenes; a scene without the oracle's answer "
         "counts as possible if its construction or a path that keeps the clearance shows it. Only the scenes with a "
