@@ -185,8 +185,8 @@ def scenes_table(results: StaticResults) -> Table:
     )
     checked = sum(ORACLE in rows_ for rows_ in results.by_scene.values())
     verdict = (
-        "In scenes that the oracle proves impossible, no path through the exact start, goal and contact point keeps the "
-        "clearance."
+        "In scenes that the oracle proves impossible, no path through the exact start, goal and contact point keeps "
+        "the clearance."
     )
     if wrong:
         verdict = f"The oracle is wrong. A method solves a scene that the oracle calls impossible: {'; '.join(wrong)}."
