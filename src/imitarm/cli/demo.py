@@ -165,6 +165,7 @@ def _sweep(
             forbidden=HORIZONTAL_ONLY,
             time_constant=_TIME_CONSTANT,
             max_acceleration=_MAX_ACCELERATION,
+            max_push=_MAX_ACCELERATION,
         )
         observe: TrackedScene | None = TrackedScene(moving, SensorModel(seed=task.seed), ObstacleTracker())
     else:

@@ -116,6 +116,7 @@ def sweeping_rcamo(skill: Skill, task: SweepTask) -> RCAMO:
         forbidden=HORIZONTAL_ONLY,
         time_constant=_TIME_CONSTANT,
         max_acceleration=_MAX_ACCELERATION,
+        max_push=_MAX_ACCELERATION,
     )
 
 
