@@ -33,6 +33,7 @@ from imitarm.policies.component_path import ComponentPath
 from imitarm.policies.policy import Observation
 from imitarm.safety import SafetyFilter
 from imitarm.scene import HalfSpace
+from imitarm.tasks import DEMONSTRATIONS
 from imitarm.trajectory import Demonstration, Trajectory
 
 ARMS = {name: ArmModel.load(name, tool="gripper") for name in ("sawyer", "panda")}
@@ -323,3 +324,15 @@ def test_where_the_tool_itself_is_too_slow_only_other_paths_of_the_tool_are_trie
     assert plan.feasible
     assert durations
     assert plan.trajectory.duration < durations[0] - 0.1
+
+
+def test_a_refusal_after_components_were_divided_has_arrays_of_one_length():
+    """A ball drives into the shoulder; the last attempt had more components than the skill."""
+    arm = ArmModel.load("sawyer", tool="brush")
+    skill = Skill(10).fit(align(read(DEMONSTRATIONS)))
+    ball = Sphere([0.9, 0.0, 0.35], 0.1, velocity=[-0.15, 0.0, 0.0])
+    refused = adapt(skill, Scene(None, [ball]), arm=arm, clearance=0.02)
+    assert not refused.feasible
+    n = len(refused.means)
+    assert refused.displacement.shape == (n, 3) and refused.moved.shape == (n,) and len(refused.covariances) == n
+    assert refused.responsibilities.shape[1] == n

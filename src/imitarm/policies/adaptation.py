@@ -297,8 +297,11 @@ def of_whole_arm(
     """
     plan, timing, spent = solution.plan, solution.timing, time.perf_counter() - began
     if plan is None or not plan.complete:
-        moved = tool.displacement if plan is None else plan.displacement
-        return replace(tool, displacement=moved, feasible=False, reason=solution.reason, compute_time=spent)
+        last = tool.displacement
+        if plan is not None and plan.displacement.shape == last.shape:  # otherwise, its components were divided
+            last = plan.displacement
+        moved = np.einsum("kd,kd->k", last, last) > STILL**2
+        return replace(tool, displacement=last, moved=moved, feasible=False, reason=solution.reason, compute_time=spent)
     used = plan.components
     times = tool.nominal.times if timing is None else timing.times
     jerk = used.jerk_ratio(plan.path.positions)
