@@ -147,8 +147,25 @@ def test_the_rmse_is_compared_with_the_tool_alone_where_both_solve():
     assert [row[1:3] for row in compared.rows] == [("all", "4"), ("skill", "3"), ("other", "1")]
 
 
+def packaged(folder, robot="sawyer"):
+    """The packaged skill on an arm with the brush."""
+    return Setup(str(placements.packaged_skill(folder)), robot, "brush")
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [([], [("sawyer", "brush")]), (["--robots", "panda", "sawyer"], [("panda", "brush"), ("sawyer", "brush")])],
+)
+def test_the_packaged_skill_is_used_with_the_named_arms(options, expected, monkeypatch):
+    used = []
+    monkeypatch.setattr(placements, "run_placements", lambda policies, setups, *_, **__: used.extend(setups) or [])
+    monkeypatch.setattr("imitarm.cli.benchmark.placement_tables", lambda results: [])
+    assert cli.main(["benchmark", "placements", "--seeds", "1", *options]) in (0, 1)
+    assert [(setup.robot, setup.tool) for setup in used] == expected
+
+
 def test_the_path_of_the_tool_alone_has_the_same_ends_and_leaves_out_the_links(tmp_path):
-    setup = placements.packaged_setup(tmp_path)
+    setup = packaged(tmp_path)
     _, arm, start = placements._prepared(setup)
     path = placements._tool_path(setup).nominal
     assert path.positions[0] == pytest.approx(arm.tool_pose(start).position, abs=1e-9)
@@ -166,6 +183,6 @@ def test_the_path_of_the_tool_alone_has_the_same_ends_and_leaves_out_the_links(t
 
 
 def test_a_placement_that_is_solved_has_both_distances(tmp_path):
-    found = placements.run_placement("acfra", placements.packaged_setup(tmp_path), 0)
+    found = placements.run_placement("acfra", packaged(tmp_path), 0)
     assert found.outcome == "arrived"
     assert 0.0 < found.tool_rmse < 2.0 * found.rmse

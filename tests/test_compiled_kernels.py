@@ -9,15 +9,11 @@ import numpy as np
 import pytest
 
 import imitarm.compiled.__main__
-from compiled_code import compiled, library_at  # noqa: F401  a fixture
+from compiled_code import compiler, library_at  # noqa: F401  a fixture
 from imitarm.compiled import build, kernels, library
 from imitarm.compiled.kernels import Record, address
 from imitarm.perception import Detection, ObstacleTracker
 from imitarm.scene import Sphere
-
-needs_compiler = pytest.mark.skipif(
-    not any(shutil.which(name) for name in ("cc", "gcc", "clang")), reason="no C compiler"
-)
 
 
 def test_without_a_compiler_or_a_library_numpy_is_used(tmp_path, monkeypatch):
@@ -34,7 +30,7 @@ def test_without_a_compiler_or_a_library_numpy_is_used(tmp_path, monkeypatch):
         assert len(tracker.tracks) == 1
 
 
-@needs_compiler
+@pytest.mark.usefixtures("compiler")
 def test_a_failing_compiler_is_reported(tmp_path, monkeypatch):
     (tmp_path / "wrong.c").write_text("this is not C")
     monkeypatch.setattr(kernels, "FOLDER", tmp_path)
@@ -44,7 +40,7 @@ def test_a_failing_compiler_is_reported(tmp_path, monkeypatch):
     assert not (tmp_path / "kernels.compiled").exists()
 
 
-@needs_compiler
+@pytest.mark.usefixtures("compiler")
 def test_a_library_of_other_sources_is_not_used(tmp_path, monkeypatch):
     with library_at(tmp_path / "kernels.compiled"):
         assert build() == "built kernels.compiled"
@@ -54,7 +50,7 @@ def test_a_library_of_other_sources_is_not_used(tmp_path, monkeypatch):
         assert library() is None
 
 
-@needs_compiler
+@pytest.mark.usefixtures("compiler")
 def test_the_sources_compile_without_a_warning(tmp_path, monkeypatch):
     monkeypatch.setattr(kernels, "_OPTIONS", (*kernels._OPTIONS, "-Wall", "-Wextra", "-Werror"))
     with library_at(tmp_path / "kernels.compiled"):

@@ -289,11 +289,11 @@ def _joblib() -> Any:
     return joblib
 
 
-def packaged_setup(folder: Path) -> Setup:
-    """Learn the skill 'sweep' of the package, save it in ``folder``, and return it with the Sawyer and its brush."""
+def packaged_skill(folder: Path) -> Path:
+    """Learn the skill 'sweep' of the package, save it in ``folder``, and return the file."""
     from imitarm.demonstrations import align, read  # noqa: PLC0415 (only here)
     from imitarm.tasks.sweep import DEMONSTRATIONS  # noqa: PLC0415 (only here)
 
     place = folder / "sweep.json"
     Skill().fit(align(read(DEMONSTRATIONS))).save(place)
-    return Setup(str(place), "sawyer", "brush")
+    return place

@@ -162,7 +162,7 @@ def _add_placements(parsers: Any) -> None:
         type=Path,
         nargs="+",
         metavar="FILE",
-        help="skill files; default: the skill 'sweep' of the package, with Sawyer and brush",
+        help="skill files; default: the skill 'sweep' of the package, with the brush as default tool",
     )
     placed.add_argument("--robots", nargs="+", metavar="NAME", help="use several arms; replaces --robot")
     placed.add_argument("--policies", nargs="+", choices=POLICIES, default=["acfra"], metavar="NAME")
@@ -339,11 +339,11 @@ def _placements(arguments: argparse.Namespace) -> int:
         raise InputError("--out needs --skill, because the default skill is not a file")
     place = place_of(arguments, "placements")
     with tempfile.TemporaryDirectory() as folder, progress_bar() as bar:
-        if arguments.skill is None:
-            setups = [placements.packaged_setup(Path(folder))]
-        else:
-            robots = arguments.robots or [arguments.robot]
-            setups = [Setup(str(skill), arm, arguments.tool) for skill in arguments.skill for arm in robots]
+        skills, tool = arguments.skill, arguments.tool
+        if skills is None:
+            skills, tool = [placements.packaged_skill(Path(folder))], tool or "brush"
+        robots = arguments.robots or [arguments.robot]
+        setups = [Setup(str(skill), arm, tool) for skill in skills for arm in robots]
         task = bar.add_task("reproducing", total=None)
         results = placements.run_placements(
             arguments.policies,

@@ -18,8 +18,8 @@ from imitarm.errors import InputError
 from imitarm.files.document import write_text
 from imitarm.perception import ObstacleTracker
 from imitarm.policies import ACFRA, ADAPTERS, HORIZONTAL_ONLY, Policy
-from imitarm.policies.rcamo import RCAMO
 from imitarm.skills import Skill
+from imitarm.tasks.pushed_cube import LINKS, sweeping_rcamo
 from imitarm.tasks.sweep import DEMONSTRATIONS, MOVING_SCENES, NUMBERED_SCENES, SCENES, SweepTask
 from imitarm.trajectory import Demonstration
 from imitarm.viewer import Report, SceneResult, as_data, write_report
@@ -45,9 +45,7 @@ The exit status is 1 if a scene fails or the arm touches an obstacle.
 
 DEMO_SCENES = ("free", "two_boxes", "tall_and_low", "boxes_and_cone", "cone_first", *MOVING_SCENES)
 
-# [s], [m/s^2] of RCAMO: a faster push would tilt the brush until it touches the table
-_TIME_CONSTANT, _MAX_ACCELERATION = 1.5, 9.0
-LINKS = 0.01  # [m] clearance that the safety filter keeps from moving obstacles
+_MAX_ACCELERATION = 9.0  # [m/s^2] of the Sawyer's brush; more would tilt the brush until it touches the table
 
 _SUMMARY = (
     "A Sawyer learns from eight demonstrations to sweep crumbs into a dustpan. The Sawyer then sweeps "
@@ -158,15 +156,7 @@ def _sweep(
     if name in MOVING_SCENES:
         moving = task.moving_scene(name)
         robot = task.robot(moving)
-        policy = RCAMO(
-            skill,
-            tool_spheres=[[0.0, 0.0, 0.0, task.tool_radius]],
-            clearance=task.clearance,
-            forbidden=HORIZONTAL_ONLY,
-            time_constant=_TIME_CONSTANT,
-            max_acceleration=_MAX_ACCELERATION,
-            max_push=_MAX_ACCELERATION,
-        )
+        policy = sweeping_rcamo(skill, task, max_acceleration=_MAX_ACCELERATION)
         observe: TrackedScene | None = TrackedScene(moving, SensorModel(seed=task.seed), ObstacleTracker())
     else:
         robot = task.robot(task.scene(name))

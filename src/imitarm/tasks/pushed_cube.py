@@ -31,7 +31,8 @@ Observer = Callable[[MovingScene, SimulatedRobot, int], Callable[[float], Scene]
 
 LINKS = 0.01
 """Clearance that the safety filter keeps between the links and obstacles [m]."""
-_TIME_CONSTANT, _MAX_ACCELERATION = 1.5, 4.0  # [s], [m/s^2] faster, a joint reaches its limit and the brush tilts
+_TIME_CONSTANT = 1.5  # [s] of RCAMO
+_MAX_ACCELERATION = 4.0  # [m/s^2] of the brush of the Panda
 _TIMEOUT = 2.0  # longest duration over the learned duration
 _EYE, _MIDDLE = np.array([1.55, 0.0, 0.95]), np.array([0.58, -0.02, 0.05])  # [m]
 _WORKSPACE = ((0.25, -0.65, 0.032), (1.05, 0.50, 0.5))  # [m] above the dirt and the walls of the dustpan
@@ -107,16 +108,23 @@ def learned_sweep() -> Skill:
     return Skill().fit(align(read(DEMONSTRATIONS)))
 
 
-def sweeping_rcamo(skill: Skill, task: SweepTask) -> RCAMO:
-    """Return the policy RCAMO for the sweep: the brush stays on the table, and evades only to the left or right."""
+def sweeping_rcamo(skill: Skill, task: SweepTask, *, max_acceleration: float) -> RCAMO:
+    """Return the policy RCAMO for the sweep: the brush stays on the table, and evades only to the left or right.
+
+    Args:
+        skill: the learned sweep.
+        task: the task, with the radius of the brush and the required clearance.
+        max_acceleration: largest acceleration of the brush away from the learned path [m/s^2]. If the brush is faster
+            than the joints of the arm allow, it tilts and touches the table.
+    """
     return RCAMO(
         skill,
         tool_spheres=[[0.0, 0.0, 0.0, task.tool_radius]],
         clearance=task.clearance,
         forbidden=HORIZONTAL_ONLY,
         time_constant=_TIME_CONSTANT,
-        max_acceleration=_MAX_ACCELERATION,
-        max_push=_MAX_ACCELERATION,
+        max_acceleration=max_acceleration,
+        max_push=max_acceleration,
     )
 
 
@@ -146,7 +154,7 @@ def run_pushed_cube(
     robot = task.robot(delayed(truth) if observer is watched_cube else truth, arm=arm)
     observe = (sensed_cube if observer is None else observer)(truth, robot, seed)
     done = reproduce(
-        sweeping_rcamo(skill, task),
+        sweeping_rcamo(skill, task, max_acceleration=_MAX_ACCELERATION),
         robot,
         observe,
         dt=PERIOD,
