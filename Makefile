@@ -7,7 +7,7 @@ JOBS   ?= 2
 MEDIAPIPE ?= mediapipe
 VIDEOS := .cache/pose2sim
 # compiled where there is a C compiler; without one, NumPy does the same
-KERNELS := $(wildcard src/imitarm/compiled/*.[ch])
+KERNELS := $(wildcard src/imitarm/compiled/*.[ch]) src/imitarm/compiled/kernels.py
 export MPLBACKEND = Agg
 # one thread for each numerical library: this work is many small matrices, and the tests already run side by side
 export OMP_NUM_THREADS ?= 1
@@ -18,7 +18,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 help:  ## list the tasks
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
 
-demo: $(VENV)/.report  ## learn a sweep from demonstrations, do it around obstacles, write demo/report.html
+demo: $(VENV)/.report $(VENV)/.demo-compiled  ## learn a sweep from demonstrations, do it around obstacles, write demo/report.html
 	$(BIN)/imitarm demo --force
 
 install: $(VENV)/.dev $(VENV)/.compiled  ## the development environment in .venv
@@ -86,6 +86,9 @@ $(BIN)/python:
 
 $(VENV)/.report: $(BIN)/python pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable '.[report]'
+	@touch $@
+
+$(VENV)/.demo-compiled: $(KERNELS) | $(VENV)/.report
 	$(BIN)/python -m imitarm.compiled
 	@touch $@
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -11,12 +12,33 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from compiled_code import library_at
+from imitarm.compiled import kernels
+
 # the same examples in every run, and no clock: a loaded machine fails nothing
 settings.register_profile("imitarm", deadline=None, derandomize=True, max_examples=50)
 settings.load_profile("imitarm")
 
 # pytest-xdist sets it for its workers: what commands print would be broken at 80 columns, theirs and their children's
 os.environ.pop("COLUMNS", None)
+
+
+@pytest.fixture(scope="module")
+def compiler():
+    """Require a C compiler; without one, the test is skipped, but in CI it fails."""
+    if not any(shutil.which(name) for name in kernels._COMPILERS):
+        if os.environ.get("CI") == "true":
+            pytest.fail("no C compiler; in CI the compiled code must be tested")
+        pytest.skip("no C compiler")
+
+
+@pytest.fixture(scope="module")
+def compiled(compiler, tmp_path_factory):
+    """Use compiled code that was built for these tests."""
+    with library_at(tmp_path_factory.mktemp("kernels") / "kernels.compiled"):
+        assert kernels.build() == "built kernels.compiled"
+        assert kernels.library() is not None
+        yield
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

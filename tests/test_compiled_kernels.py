@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import imitarm.compiled.__main__
-from compiled_code import compiler, library_at  # noqa: F401  a fixture
+from compiled_code import library_at
 from imitarm.compiled import build, kernels, library
 from imitarm.compiled.kernels import Record, address
 from imitarm.perception import Detection, ObstacleTracker
@@ -72,3 +72,19 @@ def test_the_program_builds_only_when_it_is_run(monkeypatch, capsys):
     assert capsys.readouterr().out == ""
     runpy.run_path(imitarm.compiled.__main__.__file__, run_name="__main__")
     assert capsys.readouterr().out == "built it\n"
+
+
+def test_an_array_that_is_not_contiguous_has_no_address():
+    assert address(np.arange(4.0)[:0]) and address(np.arange(4.0))
+    with pytest.raises(ValueError, match="contiguous"):
+        address(np.arange(9.0).reshape(3, 3)[:, 1])
+
+
+def test_the_compiler_options_count_as_sources(monkeypatch):
+    before = kernels._of_the_sources()
+    monkeypatch.setattr(kernels, "_OPTIONS", (*kernels._OPTIONS, "-O3"))
+    assert kernels._of_the_sources() != before
+
+
+def test_a_record_holds_real_numbers_only_where_they_are_floats():
+    assert Record(1.0)._memory.view(np.float64)[0] == 1.0 and Record(1)._memory[0] == 1

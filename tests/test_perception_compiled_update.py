@@ -7,7 +7,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from compiled_code import compiled  # noqa: F401  a fixture
 from imitarm.perception import Detection, ObstacleTracker
 from imitarm.perception.motion_filter import MotionFilter, updated
 from imitarm.scene import Sphere

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compiled_code import by_numpy, compiled  # noqa: F401  a fixture
+from compiled_code import by_numpy
 from imitarm.demonstrations import align
 from imitarm.kinematics.arm import ArmState
 from imitarm.kinematics.pose import Pose

@@ -9,11 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compiled_code import by_numpy, compiled  # noqa: F401  a fixture
+from compiled_code import by_numpy
 from imitarm import ArmModel
+from imitarm.command import Command
+from imitarm.compiled import library
+from imitarm.errors import InputError
 from imitarm.kinematics.ik_problem import Box
 from imitarm.kinematics.limits import JointLimits
-from imitarm.scene import HalfSpace, Scene
+from imitarm.safety import SafetyFilter
+from imitarm.scene import HalfSpace, Scene, Sphere
 from imitarm.scene.clearance import SelfClearance
 from imitarm.scene.clearance_limit import ClearanceLimit
 from imitarm.scene.distances import KINDS as PACKED_KINDS
@@ -117,3 +121,57 @@ def test_a_scene_can_be_sent_to_another_process_after_use():
     again = pickle.loads(pickle.dumps(scene))
     del scene
     np.testing.assert_array_equal(limit.rows(arm.home, again).matrix, before.matrix)
+
+
+@pytest.mark.parametrize("way", [by_numpy, lambda call, *arguments: call(*arguments)], ids=["numpy", "compiled"])
+def test_the_layout_of_an_array_in_memory_changes_nothing_and_a_wrong_length_is_refused(way):
+    arm = ArmModel.load("sawyer", tool="gripper")
+    rng = np.random.default_rng(3)
+    scene = scene_around(rng, KINDS)
+    limit, own = ClearanceLimit(arm, 0.02), SelfClearance(arm)
+    q, log = posture(rng, arm), rng.normal(size=(arm.n_joints, 3))
+    margins, bounds = rng.uniform(0.0, 0.05, (len(scene.obstacles), 2)), np.full((arm.n_joints, 2), [-0.5, 0.5])
+    strided = Box(bounds[:, 0], bounds[:, 1])
+    same = Box(bounds[:, 0].copy(), bounds[:, 1].copy())
+    one = way(limit.near, q, scene, log[:, 1], margins[:, 0], strided)
+    other = way(limit.near, q, scene, log[:, 1].copy(), margins[:, 0].copy(), same)
+    assert len(one.room)
+    for found, expected in zip(one.rows, other.rows, strict=True):
+        np.testing.assert_array_equal(found, expected)
+    near = way(own.rows, q, strided)
+    expected = way(own.rows, q, same)
+    assert (near is None) == (expected is None)
+    if near is not None:
+        np.testing.assert_array_equal(near[0], expected[0])
+    for wrong, what in (((log[:2, 0],), "velocity"), ((None, margins[:1, 0].tolist() * 99), "margins")):
+        with pytest.raises(InputError, match=what):
+            way(limit.near, q, scene, *wrong)
+    with pytest.raises(InputError, match="box"):
+        way(limit.near, q, scene, None, None, Box(bounds[:3, 0], bounds[:3, 1]))
+
+
+def test_the_filter_takes_a_velocity_from_a_column_of_a_log():
+    arm = ArmModel.load("sawyer", tool="gripper")
+    log = np.random.default_rng(1).normal(0.0, 0.2, (arm.n_joints, 4))
+    safety = SafetyFilter(arm, clearance=0.02)
+    scene = Scene(None, [Sphere(arm.tool_pose(arm.home).position + [0.0, 0.08, 0.0], 0.03, velocity=[0.0, -0.3, 0.0])])
+    command = Command(np.array([0.1, 0.2, 0.0, 0.0, 0.0, 0.0]))
+    found = safety.step(command, arm.home, log[:, 2], scene).velocity
+    np.testing.assert_array_equal(found, safety.step(command, arm.home, log[:, 2].copy(), scene).velocity)
+
+
+def test_both_ways_are_really_different_ways(monkeypatch):
+    calls = []
+    kernels = library()
+
+    class Counted:
+        def __getattr__(self, name):
+            calls.append(name)
+            return getattr(kernels, name)
+
+    monkeypatch.setattr("imitarm.scene.arm_rows.library", Counted)
+    arm = ArmModel.load("sawyer", tool="gripper")
+    rng = np.random.default_rng(0)
+    ClearanceLimit(arm, 0.02).near(posture(rng, arm), scene_around(rng, KINDS))
+    SelfClearance(arm).rows(arm.home)
+    assert {"obstacle_rows", "self_rows"} <= set(calls)

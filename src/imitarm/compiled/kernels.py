@@ -6,6 +6,7 @@ import ctypes
 import hashlib
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -36,13 +37,14 @@ def build() -> str:
     compiler = next((path for name in _COMPILERS if (path := shutil.which(name))), None)
     if compiler is None:
         return "no C compiler was found; NumPy is used"
-    made = LIBRARY.with_suffix(".new")
     sources = [str(path) for path in sorted(FOLDER.glob("*.c"))]
-    command = [compiler, *_OPTIONS, f"-DIMITARM_SOURCES={_of_the_sources()}", "-o", str(made), *sources, "-lm"]
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
-    if done.returncode != 0:
-        return f"{Path(compiler).name} failed; NumPy is used:\n{done.stderr}"
-    made.replace(LIBRARY)
+    with tempfile.TemporaryDirectory(dir=LIBRARY.parent, prefix=".build") as folder:  # two builds do not meet
+        made = Path(folder) / LIBRARY.name
+        command = [compiler, *_OPTIONS, f"-DIMITARM_SOURCES={_of_the_sources()}", "-o", str(made), *sources, "-lm"]
+        done = subprocess.run(command, check=False, capture_output=True, text=True)
+        if done.returncode != 0:
+            return f"{Path(compiler).name} failed; NumPy is used:\n{done.stderr}"
+        made.replace(LIBRARY)
     library.cache_clear()
     return f"built {LIBRARY.name}"
 
@@ -61,10 +63,16 @@ def library() -> Any:
 
 
 def address(array: NDArray[Any]) -> int:
-    """Return the memory address of an array; the caller must keep the array as long as it uses the address."""
+    """Return the memory address of an array; the caller must keep the array as long as it uses the address.
+
+    Raises:
+        ValueError: when the numbers of the array do not follow each other in memory.
+    """
     try:
         return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]  # the fastest way
     except (TypeError, ValueError, BufferError):  # an array that is read-only, empty or not contiguous
+        if not array.flags.c_contiguous:
+            raise ValueError(f"compiled code needs contiguous arrays, got strides {array.strides}") from None
         place: int = array.__array_interface__["data"][0]
         return place
 
@@ -105,8 +113,8 @@ class Record:
 
 
 def _of_the_sources() -> int:
-    """Return a number that changes with every change of the sources."""
-    known = hashlib.sha256()
+    """Return a number that changes with every change of the sources and of the compiler's options."""
+    known = hashlib.sha256(" ".join(_OPTIONS).encode())
     for path in sorted([*FOLDER.glob("*.c"), *FOLDER.glob("*.h")]):
         known.update(path.read_bytes())
     return int.from_bytes(known.digest()[:7], "big")

@@ -210,10 +210,8 @@ class LeastCost:
         sizes = (*(len(x) for x in (self.times, spheres)), *candidates.shape, len(rates), len(one_sided))
         arrays = (self.times, response.A, response.B, self._gains, self._weights, task, pull, candidates)
         more = (one_sided, rates, self._waiting, cost.radii, spheres)
-        influence = float(cost.influence_distance)
-        return Record(
-            *sizes,
-            *[np.ascontiguousarray(x, dtype=float) for x in (*arrays, *more)],
+        influence = cost.influence_distance
+        factors = (
             curvature,
             self.change_weight,
             self.size_weight + self.change_weight,
@@ -222,10 +220,12 @@ class LeastCost:
             cost.width,
             influence,
             tool_radius + self.travel + influence,
-            float(np.abs(response.A - 1.0).max()),
-            float(np.abs(response.B).max()),
+            np.abs(response.A - 1.0).max(),
+            np.abs(response.B).max(),
             *numbers,
         )
+        every = [np.ascontiguousarray(x, dtype=float) for x in (*arrays, *more)]
+        return Record(*sizes, *every, *(float(factor) for factor in factors))
 
     @property
     def travel(self) -> float:

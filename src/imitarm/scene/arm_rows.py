@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.compiled import library
 from imitarm.compiled.kernels import Record, address
+from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_kinematics import ArmMemory
 from imitarm.kinematics.ik_problem import Box, Rows
@@ -24,6 +25,26 @@ from imitarm.scene.scene import Scene
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
+
+
+_MOST_JOINTS = 64  # MAX_JOINTS in arm_rows.c
+
+
+def has_kernels(arm: ArmModel) -> bool:
+    """Return whether compiled code is there, and has room for the joints of the arm."""
+    return library() is not None and arm.n_joints <= _MOST_JOINTS
+
+
+def numbers(values: ArrayLike, n: int, name: str) -> Array:
+    """Return ``n`` numbers in a contiguous array, as compiled code reads them.
+
+    Raises:
+        InputError: when there are more or fewer numbers.
+    """
+    array = np.ascontiguousarray(values, dtype=np.float64)
+    if array.shape != (n,):
+        raise InputError(f"{name} must have shape ({n},), got {array.shape}")
+    return array
 
 
 class NearRows(NamedTuple):
@@ -54,7 +75,7 @@ def compiled_near_rows(
 ) -> NearRows | None:
     """Return the rows of ``ClearanceLimit``, computed by compiled code, which must exist; None if there is no row.
 
-    All arrays must be contiguous.
+    The arrays must be those of :func:`numbers`.
 
     Args:
         limit: the C structure ``Limit``.
@@ -176,15 +197,15 @@ class SpherePairs:
             box: bounds of the joint velocity; if no velocity within these bounds violates an inequality, the result may
                 be None.
         """
-        kernel = library()
-        if kernel is None:
+        if not has_kernels(arm):
             return self._rows_by_numpy(arm, q, nearness)
         memory = arm.at(q)
         n_groups, _, _, most = nearness
         room = _room(memory, "own rows", most + n_groups, 2 * (len(self.sums) + len(self.starts)))
-        bounds = (None, None) if box is None else (address(box.lower), address(box.upper))
+        within = () if box is None else [numbers(bound, arm.n_joints, "box") for bound in box]
+        bounds = tuple(address(bound) for bound in within) or (None, None)
         places = self._record.address, *_arm_of(self.cover, memory)
-        k = kernel.self_rows(*places, *nearness, *demand, *bounds, *room.addresses)
+        k = library().self_rows(*places, *nearness, *demand, *bounds, *room.addresses)
         if not k:
             return None
         return OwnRows(room.indices.ravel()[:k].copy(), room.values.ravel()[:k].copy(), room.rows[:k].copy())

@@ -9,11 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from imitarm.compiled import library
 from imitarm.compiled.kernels import Record
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.ik_problem import Box, Rows, violable
-from imitarm.scene.arm_rows import NearRows, compiled_near_rows
+from imitarm.scene.arm_rows import NearRows, compiled_near_rows, has_kernels, numbers
 from imitarm.scene.braking import APPROACH_RATE, LONGEST_YIELD, SHARE, shrink_rates
 from imitarm.scene.distances import PackedObstacles, near_pairs
 from imitarm.scene.scene import Scene
@@ -99,7 +98,7 @@ class ClearanceLimit:
             that is too close has no row if no joint can change its distance.
 
         Raises:
-            InputError: when ``q`` is not n_joints finite numbers.
+            InputError: when ``q`` is not n_joints finite numbers, or ``velocity`` is not n_joints numbers.
         """
         found = self.near(q, scene, velocity)
         return None if found is None else found.rows
@@ -125,9 +124,11 @@ class ClearanceLimit:
         packed = scene.packed
         if not len(packed):
             return None
-        speed = None if velocity is None else np.asarray(velocity, dtype=float)
-        within = self._free if box is None else box
-        if library() is None:
+        n = self.arm.n_joints
+        speed = None if velocity is None else numbers(velocity, n, "velocity")
+        margins = None if margins is None else numbers(margins, len(packed), "margins")
+        within = self._free if box is None else Box(*(numbers(bound, n, "box") for bound in box))
+        if not has_kernels(self.arm):
             return self._near_by_numpy(q, scene, speed, margins, within)
         reach = self._reach(packed, margins)
         return compiled_near_rows(self._record, self._cover, self.arm.at(q), scene, reach, margins, speed, within)
@@ -135,10 +136,9 @@ class ClearanceLimit:
     @cached_property
     def _record(self) -> Record:
         """The C structure ``Limit``."""
-        limits = self._reduced, self.arm.max_acceleration, self.arm.max_velocity
-        return Record(
-            *limits, self.delay, self.rate, self.retreat_rate, self.deviations, SHARE, LONGEST_YIELD, _UNMOVED
-        )
+        arrays = self._reduced, self.arm.max_acceleration, self.arm.max_velocity
+        factors = self.delay, self.rate, self.retreat_rate, self.deviations, SHARE, LONGEST_YIELD, _UNMOVED
+        return Record(*arrays, *(float(factor) for factor in factors))
 
     def _near_by_numpy(
         self, q: ArrayLike, scene: Scene, velocity: Array | None, margins: Array | None, box: Box
