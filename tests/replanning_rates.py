@@ -1,4 +1,4 @@
-"""Rates of certified re-planning among one moving obstacle on a collision course, and the time of one plan.
+"""Rates of certified re-planning with one moving obstacle on a collision course; time of a plan with one to three.
 
 ``python tests/replanning_rates.py [number of seeds] [rate of the sensor, 0 observes the truth]`` prints, for two arms
 and three families of motion, how many runs arrive without contact within twice the learned duration. The obstacle is a

@@ -163,7 +163,7 @@ def test_the_choice_equals_that_of_all_candidates_computed_one_by_one(seed, kind
 def test_push_spring_and_damper_together_keep_the_acceleration_limit(seed):
     rng = np.random.default_rng(seed)
     cost, axes = DistanceCost(0.02, np.array([0.03])), frame(np.array([0.6, 0.8, 0.0]), np.eye(3))
-    chooser = LeastCost(TIMES, GAINS["critical"], 1.5, cost, 20.0, headings(np.eye(3)), limit=10.0)
+    chooser = LeastCost(TIMES, GAINS["critical"], 1.5, cost, 20.0, headings(np.eye(3)), max_acceleration=10.0)
     free, start = chooser.response.free(rng.uniform(-0.02, 0.02, (2, 3))), rng.uniform(-0.1, 0.1, 3)
 
     def predict(rates):
@@ -174,5 +174,5 @@ def test_push_spring_and_damper_together_keep_the_acceleration_limit(seed):
     pull = rng.uniform(-4.0, 4.0, 3)
     found = chooser.choose(*given, pull)
     assert not found.scaled.any() or np.linalg.norm(20.0 * found.scaled - pull) <= 10.0 + 1e-9
-    unlimited = dataclasses.replace(chooser, limit=np.inf)
+    unlimited = dataclasses.replace(chooser, max_acceleration=np.inf)
     np.testing.assert_array_equal(unlimited.choose(*given, pull).scaled, chooser.choose(*given).scaled)

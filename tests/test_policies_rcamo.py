@@ -13,6 +13,7 @@ from imitarm.kinematics.arm import ArmState
 from imitarm.kinematics.pose import Pose, quaternion_exp, quaternion_multiply
 from imitarm.perception import CoverageMargin
 from imitarm.policies import HORIZONTAL_ONLY, NOT_DOWN, POLICIES, RCAMO, DistanceCost, Observation
+from imitarm.policies.least_cost import Response
 from imitarm.scene import Box, HalfSpace, MovingScene, Scene, Sphere
 from imitarm.skills import Skill
 from imitarm.tasks import DEMONSTRATIONS, SweepTask
@@ -300,3 +301,10 @@ def test_a_simulated_arm_evades_an_obstacle_on_its_path():
     done = reproduce(policy, robot, MovingScene(scene).at, timeout=2.0 * skill.duration_)
     assert done.success, done.reason
     assert done.min_clearance > 0.02 and done.details["statuses"]["avoiding"] > 50
+
+
+@pytest.mark.parametrize(("time_constant", "largest"), [(2.0, 0.57), (1.0, 0.14)])
+def test_the_largest_deviation_is_that_of_the_documentation(skill, time_constant, largest):
+    policy = RCAMO(skill, tool_spheres=[[0.0, 0.0, 0.0, 0.03]], time_constant=time_constant)
+    held = Response.of(policy.gains, time_constant, np.array([50.0])).G[0] * policy.least_cost.max_push
+    assert held == pytest.approx(largest, abs=0.005)

@@ -90,7 +90,7 @@ class Choice(NamedTuple):
     """The candidate of least cost.
 
     Attributes:
-        scaled: coupling acceleration u / a_max, shape (3,).
+        scaled: coupling acceleration u / u_max, shape (3,).
         rate: speed of the phase; 1 is the learned speed.
         cost: predicted cost of this candidate.
         nearest: index of the obstacle that comes nearest; -1 if none is near.
@@ -135,25 +135,25 @@ class LeastCost:
         gains: stiffness and damping of the deviation.
         time_constant: tau, the time constant of the deviation [s].
         obstacle_cost: b, the cost of being near an obstacle.
-        max_acceleration: a_max, the largest coupling acceleration [m/s^2].
+        max_push: u_max, the largest coupling acceleration [m/s^2].
         units: headings in the frame of :func:`~imitarm.policies.headings.frame`, shape (k, d).
-        limit: largest acceleration of the deviation by u, spring and damper together [m/s^2].
+        max_acceleration: largest acceleration of the deviation by u, spring and damper together [m/s^2].
         discount: gamma, the factor by which the weight decreases from one instant to the next.
         deviation_weight: w_e, weight of the deviation [1/m^2].
         change_weight: w_Delta, weight of a change of u since the last step.
         size_weight: w_u, weight of the size of u.
         wait_weight: w_r, weight of the difference between r and the learned speed 1.
         rates: speeds of the phase that are candidates; the first speed is 1.
-        sizes: sizes of u, as fractions of a_max.
+        sizes: sizes of u, as fractions of u_max.
     """
 
     times: Array
     gains: Gains
     time_constant: float
     obstacle_cost: ObstacleCost
-    max_acceleration: float
+    max_push: float
     units: Array
-    limit: float = math.inf
+    max_acceleration: float = math.inf
     discount: float = 0.93
     deviation_weight: float = 16.0
     change_weight: float = 0.02
@@ -173,8 +173,8 @@ class LeastCost:
 
     @cached_property
     def _gains(self) -> Array:
-        """Deviation at each instant per unit of u / a_max, shape (H,) [m]."""
-        return self.max_acceleration * self.response.G
+        """Deviation at each instant per unit of u / u_max, shape (H,) [m]."""
+        return self.max_push * self.response.G
 
     @cached_property
     def _task(self) -> tuple[Array, Array, float]:
@@ -185,7 +185,7 @@ class LeastCost:
 
     @cached_property
     def _candidates(self) -> tuple[Array, Array]:
-        """All candidates u / a_max in the frame of the motion (C, d), and the cost of their size (C,)."""
+        """All candidates u / u_max in the frame of the motion (C, d), and the cost of their size (C,)."""
         zero = np.zeros((1, self.units.shape[1]))
         scaled = np.concatenate([zero, *[size * self.units for size in self.sizes]])
         return scaled, (self.size_weight + self.change_weight) * np.sum(scaled * scaled, axis=1)
@@ -215,7 +215,7 @@ class LeastCost:
             curvature,
             self.change_weight,
             self.size_weight + self.change_weight,
-            self.limit / self.max_acceleration,
+            self.max_acceleration / self.max_push,
             cost.clearance,
             cost.width,
             influence,
@@ -238,9 +238,9 @@ class LeastCost:
         The task cost is a quadratic form in u, so the deviations of the candidates are not needed.
 
         Args:
-            scaled: u / a_max of the candidates, shape (C, 3).
+            scaled: u / u_max of the candidates, shape (C, 3).
             sizes: cost of the size of each candidate, shape (C,).
-            previous: u / a_max of the last choice, shape (3,).
+            previous: u / u_max of the last choice, shape (3,).
             free: deviations without coupling, shape (H, 3) [m].
             precision: Theta, shape (3, 3).
         """
@@ -266,13 +266,13 @@ class LeastCost:
     ) -> Choice:
         """Return the candidate of least cost.
 
-        A candidate that would accelerate the deviation by more than ``limit`` is moved towards ``pull``, until it does
-        not.
+        A candidate that would accelerate the deviation by more than ``max_acceleration`` is moved towards ``pull``
+        until its acceleration is ``max_acceleration``.
 
         Args:
             axes: frame of the motion, shape (3, d).
             one_sided: directions along which u must have no positive component, shape (m, 3).
-            previous: u / a_max of the last choice, shape (3,).
+            previous: u / u_max of the last choice, shape (3,).
             free: deviations without coupling, shape (H, 3) [m].
             precision: Theta at the current phase, shape (3, 3).
             predict: function that takes speeds of the phase (R,) and returns the motion without coupling.
@@ -283,7 +283,7 @@ class LeastCost:
         scaled, sizes = self._candidates
         scaled = scaled @ axes.T
         if pull is not None:
-            scaled, sizes = self._feasible(scaled, sizes, pull / self.max_acceleration)
+            scaled, sizes = self._feasible(scaled, sizes, pull / self.max_push)
         if len(one_sided):
             allowed = (scaled @ one_sided.T <= 1e-9).all(axis=1)
             scaled, sizes = scaled[allowed], sizes[allowed]
@@ -305,7 +305,7 @@ class LeastCost:
     def _feasible(self, scaled: Array, sizes: Array, pull: Array) -> tuple[Array, Array]:
         """Return candidates whose acceleration, less that of spring and damper, keeps the limit; the first one is 0."""
         change = scaled - pull
-        factor = self.limit / self.max_acceleration / np.sqrt(np.maximum(np.sum(change * change, axis=1), 1e-12))
+        factor = self.max_acceleration / self.max_push / np.sqrt(np.maximum(np.sum(change * change, axis=1), 1e-12))
         factor[0] = 1.0
         if factor.min() >= 1.0:
             return scaled, sizes

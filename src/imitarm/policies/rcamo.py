@@ -136,7 +136,7 @@ class RCAMO(Policy):
             whole = LeastCost.deviation_weight * float(np.sum(LeastCost.discount ** np.arange(1.0, steps + 1.0)))
             obstacle_cost = GaussianCost(self.clearance, spheres[:, 3], stiffness=whole)
         self.least_cost = LeastCost(
-            times, self.gains, self._tau, obstacle_cost, push, headings(self._axes), limit=limit
+            times, self.gains, self._tau, obstacle_cost, push, headings(self._axes), max_acceleration=limit
         )
         self._dmp, self._precision = _primitive(skill, self.gains), learned_precision(skill)
         self._steps: dict[float, Response] = {}
@@ -226,7 +226,7 @@ class RCAMO(Policy):
         chosen = self._choose(observation, path, lag)
         self._scaled = chosen.scaled
         rate = chosen.rate * max(0.0, 1.0 - (away / self._patience) ** 2)
-        phase = self._advance(rate, self.least_cost.max_acceleration * chosen.scaled, dt)
+        phase = self._advance(rate, self.least_cost.max_push * chosen.scaled, dt)
         moved = path.position(self._phase) + self._deviation[0]
         twist = np.empty(6)
         twist[:3] = (moved - reference) / dt - self._gain * lag
@@ -280,7 +280,7 @@ class RCAMO(Policy):
             margins = np.ascontiguousarray(self._margins(packed.covariances, elapsed))
         axes = frame(path.tangent(self._phase), self._axes)
         state[:3], state[3:6], state[6:12] = observation.tool_to_base.position, lag, self._deviation.ravel()
-        state[12:15], state[15:18] = self._scaled, self._spring() / self.least_cost.max_acceleration
+        state[12:15], state[15:18] = self._scaled, self._spring() / self.least_cost.max_push
         state[18:21] = self._phase, self._rate, elapsed
         state[21 : 21 + axes.size] = axes.ravel()
         places = constants, path_record[2].address, address(state), None if margins is None else address(margins)
