@@ -79,13 +79,15 @@ def moving_report_html(
     shared, tabs = _tabs(chosen)
     rates = {row: results.of(row) for row in results.rows if row not in CONTROLS}
     tiles = [
-        Tile(f"{100 * sum(r.success for r in found) / len(found):.1f}", "%", f"success of {row}")
+        Tile(f"{100 * sum(r.success for r in found) / len(found):.1f}", "%", f"success of {row} in {len(found)} runs")
         for row, found in list(rates.items())[:5]
     ]
     first = next(iter(rates), None)
     good = first is not None and first.split(",")[0] in OURS
     verdict = (
-        "no method was run" if first is None else f"{first} succeeds most often, of {len(results.by_scene)} scenes"
+        "no method was run"
+        if first is None
+        else f"{first} succeeds most often: in {tiles[0].value} % of {len(rates[first])} runs"
     )
     return render(
         "avoidance.html",
@@ -133,7 +135,8 @@ def responses_chart(case: MovingCase, run: ToolRun, name: str) -> str:
     places = np.array([case.truth.poses(float(t))[0] for t in run.times])
     near = distances_in_time(case.truth, run.times, run.positions) - case.tool_spheres[0, 3] < _RESPONSE
     with canvas(name, "Paths of the tool and of the obstacles, seen from above", (5.5, 3.6)) as drawing:
-        axes = drawing.axes(0.6, 0.75, 5.35, 3.5)
+        left, bottom, right, top = 0.6, 0.75, 5.35, 3.5  # [in]
+        axes = drawing.axes(left, bottom, right, top)
         axes.plot(*learned[:, :2].T, color=palette.NOMINAL, lw=1.2, label="learned path")
         for i in range(places.shape[1]):
             there = near[i] if near[i].any() else np.zeros(len(near[i]), dtype=bool)
@@ -142,9 +145,11 @@ def responses_chart(case: MovingCase, run: ToolRun, name: str) -> str:
                 axes.plot(*np.stack([run.positions[k, :2], places[k, i, :2]]).T, color=INK, lw=0.5)
         axes.plot([], [], color=palette.OBSTACLE, lw=1.2, label="obstacle")
         axes.plot(*run.positions[:, :2].T, color=palette.ADAPTED, lw=1.6, label="tool")
-        axes.set_xlim(learned[:, 0].min() - 0.3, learned[:, 0].max() + 0.3)
-        axes.set_ylim(learned[:, 1].min() - 0.3, learned[:, 1].max() + 0.3)
-        axes.set_aspect("equal", adjustable="datalim")
+        low, high = learned[:, :2].min(axis=0) - 0.3, learned[:, :2].max(axis=0) + 0.3
+        size = np.array([right - left, top - bottom])
+        half = 0.5 * float(((high - low) / size).max()) * size  # the same scale along both axes
+        axes.set_xlim(*(0.5 * (low + high) + half * [[-1.0], [1.0]])[:, 0])
+        axes.set_ylim(*(0.5 * (low + high) + half * [[-1.0], [1.0]])[:, 1])
         axes.set_xlabel("x [m]")
         axes.set_ylabel("y [m]")
         drawing.legend(3)
