@@ -71,7 +71,7 @@ def test_the_tool_keeps_clearance_and_margin_at_all_times(seed, planar, offset, 
         assert measured >= CLEARANCE - 1e-9
     if offset + growth > 0.0:
         assert plan.only_on_schedule
-        assert "where predicted, or off by less than" in plan.validity
+        assert "is wrong by at most" in plan.validity
 
 
 def test_most_scenes_have_a_path_and_it_is_clear_by_another_library_too():

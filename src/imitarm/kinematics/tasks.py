@@ -1,7 +1,8 @@
 r"""Tasks of the inverse kinematics: desired motions, as small objects that can be combined.
 
-Each task sets a target velocity :math:`t` for a quantity whose velocity is :math:`J v`. The quadratic program minimises
-the sum of :math:`\tfrac12 |J v - t|^2` over all tasks, inside the limits.
+Let :math:`v` be the joint velocity. A task is about a quantity that moves with :math:`J v`, for example the pose of the
+tool, and sets the target velocity :math:`t` of this quantity. The solver minimises the sum of :math:`\tfrac12 |J v -
+t|^2` over all tasks, within the limits of the joints.
 """
 
 from __future__ import annotations
@@ -32,10 +33,10 @@ _LEAST = 1e-4  # squared: a quantity that changes less with the self-motion can'
 
 
 class Task(Protocol):
-    """One wanted motion. To write your own task, implement this method in a subclass."""
+    """One wanted motion. To write your own task, write a class with a method :meth:`rows`."""
 
     def rows(self, problem: IKProblem) -> TaskRows | None:
-        """Return the weighted rows of the task for one control step; None: no rows.
+        """Return the weighted equations :math:`J v = t` of the task for one step; None: the task has no effect.
 
         Raises:
             InputError: when a number of the task can't be used.
@@ -43,7 +44,7 @@ class Task(Protocol):
 
 
 class TwistTask(NamedTuple):
-    r"""Move the tool (or the flange) with a twist.
+    r"""Move the tool, or the flange, at a desired velocity (a twist).
 
     A rotation of 1 rad is weighted like a displacement of ``rotation_length``. A twist whose weighted norm exceeds
     ``max_speed`` is scaled down. Without this scaling, damped least squares would stop short of its target, because its
@@ -52,9 +53,9 @@ class TwistTask(NamedTuple):
     Attributes:
         twist: desired velocity in the base frame, linear rows first, shape (6,) [m/s, rad/s].
         frame: the frame that moves, ``"tool"`` or ``"flange"``.
-        rotation_length: displacement with the same weight as a rotation of 1 rad, used when the joints can't achieve
-            the whole twist [m]. With a smaller length, the rotation error becomes larger and the position error
-            smaller. Three numbers apply to rotations about the base's x, y and z axes.
+        rotation_length: displacement that counts as much as a rotation of 1 rad [m]. It matters only when the joints
+            can't achieve the whole twist: with a smaller value, the error of the rotation becomes larger. Three values
+            apply to rotations about the base's x, y and z axes.
         max_speed: largest weighted norm of the twist [m/s]; None: the default of the solver.
     """
 
@@ -64,7 +65,7 @@ class TwistTask(NamedTuple):
     max_speed: float | None = None
 
     def rows(self, problem: IKProblem) -> TaskRows:
-        """Return the weighted Jacobian (6, n_joints) and the clamped, weighted twist (6,)."""
+        """Return the weighted Jacobian (6, n_joints) and the weighted twist (6,), scaled down to ``max_speed``."""
         twist, frame, rotation_length, most = self
         try:
             weights, scale, effort, site = _scales(rotation_length, frame, problem.arm, problem.scaled)
@@ -97,17 +98,17 @@ class JointVelocityTask(NamedTuple):
     weight: float = 1.0
 
     def rows(self, problem: IKProblem) -> TaskRows:
-        """Return the weighted equations: an identity matrix (n_joints, n_joints) and the velocity, both scaled."""
+        """Return an identity matrix (n_joints, n_joints) and the velocity, both times the square root of the weight."""
         velocity = finite_vector(self.velocity, len(problem.q), "JointVelocityTask: velocity", "rad/s")
         root = _root(self.weight, "JointVelocityTask")
         return TaskRows(_scaled_eye(len(velocity), root), root * velocity)
 
 
 class PostureTask(NamedTuple):
-    """Drift towards a posture with the joint motion that the other tasks leave free: :math:`v = k (q_{ref} - q)`.
+    """Drift towards a posture :math:`q_{ref}` as far as the other tasks allow: :math:`v = k (q_{ref} - q)`.
 
     Attributes:
-        q: joint positions of the posture, shape (n_joints,) [rad].
+        q: joint positions :math:`q_{ref}` of the posture, shape (n_joints,) [rad].
         gain: k [1/s].
         weight: weight of this task [m^2]; the weight of a twist is 1.
     """
@@ -123,31 +124,31 @@ class PostureTask(NamedTuple):
         return np.minimum(np.maximum(drift, problem.box.lower), problem.box.upper)
 
     def rows(self, problem: IKProblem) -> TaskRows:
-        """Return the weighted equations: an identity matrix (n_joints, n_joints) and the drift, both scaled."""
+        """Return an identity matrix (n_joints, n_joints) and the drift, both times the square root of the weight."""
         root = _root(self.weight, "PostureTask")
         return TaskRows(_scaled_eye(len(problem.q), root), root * self.drift(problem))
 
 
 class ElbowTask(NamedTuple):
-    r"""Rotate the elbow to an SEW angle without affecting the task of the tool.
+    r"""Rotate the elbow to a shoulder-elbow-wrist (SEW) angle without moving the tool.
 
     The elbow moves by the arm's self-motion, a joint motion that does not move the tool. The unit vector n of the
     self-motion points along :math:`(I - J^+ J) J_\psi^T`, where J is the Jacobian of the tool's task (the first task)
-    and :math:`J_\psi` the gradient of the SEW angle. The elbow task adds the cost :math:`\tfrac{w}2\,(n^T v - s)^2`,
-    where :math:`v` is the joint velocity and s the desired speed of the self-motion:
+    and :math:`J_\psi` is the gradient of the SEW angle. The elbow task adds the cost :math:`\tfrac{w}2\,(n^T v - s)^2`,
+    where :math:`v` is the joint velocity and s is the desired speed of the self-motion:
 
     .. math:: s = c\,\min(1, 10\sin^2\!\beta)\;\frac{k\,\mathrm{wrap}(\psi_h - \psi) - J_\psi J^+ e}{J_\psi n}
 
     Here, :math:`\psi` is the arm's :func:`~imitarm.kinematics.sew.sew_angle`, :math:`\beta` is the angle at its elbow,
-    and e is the target velocity of the tool's task. The elbow's speed goes to zero as the arm becomes straight, and as
-    the wrist approaches the half-line from the shoulder on which the stereographic angle is undefined. From one step to
-    the next, the speed s changes by at most half of the change that the acceleration limits of the joints allow. As
-    long as no limit is active, the task does not affect the tool, whatever its weight. When a limit is active, the
-    weights decide between the tool's task and the elbow task.
+    and e is the target velocity of the tool's task. The elbow's speed goes to zero as the arm becomes straight. It also
+    goes to zero near the wrist positions at which the stereographic angle is undefined (a half-line from the shoulder).
+    From one step to the next, the speed s changes by at most half of the change that the acceleration limits of the
+    joints allow. While no joint reaches a limit, the elbow task does not move the tool. When a joint reaches a limit,
+    the weights decide between the tool's task and the elbow task.
 
     Attributes:
         angle: desired SEW angle :math:`\psi_h` [rad].
-        weight: weight w [m^2], relative to the weight 1 of the tool's task; 0: the task has no effect.
+        weight: weight w [m^2]; the tool's task has the weight 1.
         confidence: certainty c of the desired angle, 0 to 1; 0: the elbow is not moved.
         gain: k [1/s].
         max_rate: limit of the desired rate of the angle [rad/s].
@@ -162,7 +163,7 @@ class ElbowTask(NamedTuple):
     convention: str = "stereographic"
 
     def rows(self, problem: IKProblem) -> TaskRows | None:
-        """Return one row, for the speed along the self-motion; None if the angle or the self-motion is undefined."""
+        """Return one equation, for the speed of the self-motion; None if the angle or the self-motion is undefined."""
         angle, weight, confidence, gain, max_rate, convention = self
         try:
             usable = math.isfinite(angle + weight + confidence + gain + max_rate)
@@ -210,8 +211,8 @@ def self_motion(jacobian: Array, gradient: Array) -> tuple[Array, float, Array] 
         gradient: gradient of the quantity with respect to the joint positions, shape (n_joints,).
 
     Returns:
-        The motion as a unit vector (n_joints,), the rate at which it changes the quantity, and :math:`g^T J^+`, shape
-        (m,); None when no self-motion changes the quantity.
+        The motion as a unit vector (n_joints,); the rate at which this motion changes the quantity; and :math:`g^T
+        J^+`, shape (m,). None when no self-motion changes the quantity.
     """
     gram = jacobian.dot(jacobian.T)
     gram += _scaled_eye(len(gram), _DAMPING)

@@ -31,8 +31,7 @@ class Pairs(NamedTuple):
         tracks: index of the track of each pair, shape (k,).
         detections: index of the detection of each pair, shape (k,).
         distances: normalised innovation squared ``d^2`` of each pair (see :func:`assign`), shape (k,).
-        innovation: innovations of the pairs, that is, measured minus predicted positions; None if they must be computed
-            again.
+        innovation: measured minus predicted position of each pair; None: the caller must compute the innovations again.
     """
 
     tracks: Indices
@@ -41,7 +40,7 @@ class Pairs(NamedTuple):
     innovation: Innovation | None = None
 
     def joined(self, other: Pairs) -> Pairs:
-        """Return the pairs of both objects as one object."""
+        """Return these pairs, followed by the pairs of ``other``."""
         tracks, detections, distances = (np.concatenate(pair) for pair in zip(self[:3], other[:3], strict=True))
         return Pairs(tracks, detections, distances)
 
@@ -55,13 +54,13 @@ NO_PAIRS = Pairs(_NONE, _NONE, np.empty(0))
 
 
 def assigned(tracks: Tracks, detections: Sequence[Detection], measured: Measurements, gate: float) -> Pairs:
-    """Assign detections to tracks, each at most once; confirmed tracks choose first.
+    """Assign at most one detection to each track; confirmed tracks get their detections before the other tracks do.
 
     Args:
         tracks: the tracks, predicted to the time of the detections.
         detections: m detections.
-        measured: the same as measurements.
-        gate: largest normalised innovation squared, see :func:`assign`.
+        measured: the m detections as measurements.
+        gate: largest normalised innovation squared of a pair, see :func:`assign`.
     """
     if not len(tracks) or not detections:
         return NO_PAIRS
@@ -103,8 +102,7 @@ def assign(
     possible if the normalised innovation squared ``d^2 = nu' S^-1 nu`` is at most ``gate``, a quantile of the
     chi-square distribution with 3 degrees of freedom. The function considers only assignments with the largest possible
     number of pairs. Among these, it chooses the most probable assignment, which has the smallest sum of
-    ``d^2 + log det S``. If ``unlike`` is given, it is added to the
-    sum.
+    ``d^2 + log det S``. If ``unlike`` is given, the sum also contains the value of ``unlike`` for each pair.
 
     Args:
         positions: predicted positions of n tracks, shape (n, 3) [m].
@@ -112,8 +110,8 @@ def assign(
         measured: the m measured positions with their covariances.
         gate: largest ``d^2`` of a possible pair.
         allowed: whether each pair may be assigned, shape (n, m); None: every pair may.
-        unlike: function of the indices of k tracks and of k detections, which returns how much their shapes differ
-            (:func:`unlikeness`). It is called only if there is more than one possible assignment.
+        unlike: function of the indices of k tracks and of k detections. It returns how much their shapes differ, shape
+            (k,), see :func:`unlikeness`. It is called only if more than one assignment is possible.
     """
     n, m = len(positions), len(measured.positions)
     if not n or not m:
@@ -157,10 +155,11 @@ def squared_distances(first: Array, second: Array) -> Array:
 
 
 def unlikeness(first: Sequence[Solid], second: Sequence[Solid], sizes: Array) -> Array:
-    """Return how much the shapes of k tracks and k detections differ, shape (k,); 0 for equal ones, at most 9.
+    """Return how much the shapes of k tracks and k detections differ, shape (k,); 0 for equal shapes, at most 9.
 
-    Two kinds of shape differ by 4, because a camera can take one shape for another. For equal kinds, the difference is
-    the sum of squares of normalised differences: of sizes, in units of 20 mm, and of rotations, in units of 0.4 rad.
+    Shapes of different kinds, such as a sphere and a box, differ by 4, because a camera can confuse them. For shapes of
+    one kind, the difference is the squared difference of size, in units of 20 mm, plus the squared angle between the
+    rotations, in units of 0.4 rad.
 
     Args:
         first: shapes of the tracks, as last detected.
@@ -192,10 +191,10 @@ def _best(tracks: Indices, detections: Indices, distance: Array, log: Array, sha
 
 
 def duplicates(measured: Measurements, gate: float) -> list[tuple[int, int]]:
-    """Return the pairs ``(i, j)``, ``i < j``, of measurements whose positions do not differ significantly.
+    """Return the pairs ``(i, j)``, ``i < j``, of measurements whose positions may be equal.
 
-    "Not significantly" means that the squared distance of the positions, normalised by the sum of their covariances, is
-    at most ``gate``.
+    Two positions may be equal if their squared distance, normalised by the sum of their covariances, is at most
+    ``gate``.
     """
     positions, noise = measured.positions, measured.noise
     if len(positions) < 2:
@@ -216,7 +215,7 @@ def duplicates(measured: Measurements, gate: float) -> list[tuple[int, int]]:
 
 
 def matching_labels(labels: Sequence[str], others: Sequence[str]) -> NDArray[np.bool_] | None:
-    """Return whether label i and other label j may belong to one obstacle, shape (n, m); None if this holds for all."""
+    """Return whether label i and label j of ``others`` may be those of one obstacle, shape (n, m); None: all may."""
     if not any(labels) or not any(others):
         return None
     return np.array([[not a or not b or a == b for b in others] for a in labels])

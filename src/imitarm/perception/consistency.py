@@ -1,4 +1,4 @@
-"""Consistency: compares the errors of a filter with the covariance that the filter reports."""
+"""Consistency: compares the errors of a Kalman filter with the covariance that the filter reports."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Consistency:
-    """The mean normalised squared error of a filter, and the band in which the mean of a correct filter lies.
+    """The mean normalised squared error of a Kalman filter, and the band in which this mean lies for a correct filter.
 
     The normalised squared error is ``d^2 = e' C^-1 e``, where ``C`` is the filter's covariance of the error ``e``. For
     a correct filter, ``d^2`` has a chi-square distribution with as many degrees of freedom as ``e`` has components. If
     ``e`` is the innovation, ``d^2`` is called NIS; if ``e`` is the error of the estimate, ``d^2`` is called NEES.
-    Detections outside the gate are never assigned, so the NIS never exceeds the gate. The *band* contains the mean of
-    ``count`` independent values with a probability of 95 %. If the mean is above the band, the filter is too confident:
-    the true noise is larger than the assumed noise. If the mean is below the band, the filter is too cautious.
+    A tracker assigns no detection whose NIS exceeds a limit, the gate, so the largest possible NIS is the gate. For a
+    correct filter, the *band* contains the mean with a probability of 95 %. If the mean is above the band, the filter
+    is too confident: the true noise is larger than the assumed noise. If the mean is below the band, the filter is too
+    cautious.
 
     Attributes:
-        mean: mean of ``d^2``; nan without values.
+        mean: mean of ``d^2``; nan if there are no values.
         low: lower end of the band.
         high: upper end of the band.
         count: number of values.
@@ -38,7 +39,7 @@ class Consistency:
 
     @property
     def inside(self) -> bool:
-        """Whether the mean lies in the band; True without values."""
+        """Whether the mean lies in the band; True if there are no values."""
         return not self.count or self.low <= self.mean <= self.high
 
     @property
@@ -50,14 +51,14 @@ class Consistency:
     def of(
         cls, values: Array, degrees: int = 3, *, gate: float = math.inf, independent: float | None = None
     ) -> Consistency:
-        """Return the mean of normalised squared errors, and the band of a correct filter.
+        """Return the mean of normalised squared errors, and the band in which this mean lies for a correct filter.
 
         Args:
             values: normalised squared errors, shape (n,).
-            degrees: number of components of the error.
-            gate: largest possible value; inf without a gate.
-            independent: effective number of independent values; None: all values are independent. The errors of
-                successive estimates are correlated, so their effective number is smaller.
+            degrees: number of components of the error ``e``.
+            gate: largest value that can occur; inf: values of any size can occur.
+            independent: number of independent values that carry as much information as ``values``; None: all values are
+                independent. Errors of successive estimates are correlated, so this number is then less than n.
         """
         n = float(len(values)) if independent is None else independent
         expected, variance = chi_square_moments(degrees, gate)

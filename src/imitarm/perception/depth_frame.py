@@ -53,7 +53,7 @@ class Intrinsics:
 
     @classmethod
     def from_field_of_view(cls, width: int, height: int, vertical: float) -> Intrinsics:
-        """Return a camera with square pixels, a centred optical axis and the ``vertical`` field of view [rad]."""
+        """Return a camera with square pixels, a centred optical axis and a given vertical field of view [rad]."""
         height = whole_number(height, "height", at_least=1)
         angle = finite_number(vertical, "vertical field of view", "rad", above=0.0)
         if angle >= np.pi:
@@ -62,7 +62,7 @@ class Intrinsics:
         return cls(width, height, focal, focal, 0.5 * (whole_number(width, "width") - 1), 0.5 * (height - 1))
 
     def project(self, points: ArrayLike) -> Array:
-        """Return the columns and rows to which points are projected.
+        """Return the pixel coordinates (column u, row v) of points.
 
         Args:
             points: points in the camera's frame, shape (..., 3) [m].

@@ -15,20 +15,21 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DepthNoise:
-    r"""The noise of a depth camera: axial noise, lost pixels at edges and elsewhere, and rounding.
+    r"""The noise of a depth camera: random errors of the depth, lost pixels, and rounding.
 
-    The standard deviation of a depth ``z`` is :math:`\sigma(z) = a + b\,(z - z_0)^2`. The default values are those that
-    Nguyen, Izadi and Lovell measured for a Kinect (*Modeling Kinect sensor noise for improved 3D reconstruction and
-    tracking*, 3DIMPVT 2012): 1.2 mm at 0.4 m, 6 mm at 2 m and 41 mm at 5 m. A Kinect v2 is more accurate.
+    The standard deviation of a depth ``z`` is :math:`\sigma(z) = a + b\,(z - z_0)^2`. Nguyen, Izadi and Lovell measured
+    the default values of a, b and z_0 for a Kinect (*Modeling Kinect sensor noise for improved 3D reconstruction and
+    tracking*, 3DIMPVT 2012). With these values, the standard deviation is 1.2 mm at 0.4 m, 6 mm at 2 m and 41 mm at 5
+    m.
 
     Attributes:
         offset: ``a``, standard deviation at the depth ``z_0`` [m].
-        growth: ``b``, increase of the standard deviation with the squared difference from ``z_0`` [1/m].
+        growth: ``b``, factor of ``(z - z_0)^2`` in the standard deviation [1/m].
         nearest: ``z_0``, depth with the smallest standard deviation [m].
         edge_dropout: probability that a pixel at a depth edge is lost. At a depth edge, the depths of two neighbouring
             pixels differ by more than 5 cm.
         dropout: probability that any other pixel is lost.
-        mixed: probability that a pixel at a depth edge, if it is not lost, measures a depth between the two surfaces.
+        mixed: probability that a pixel at a depth edge measures a depth between the two surfaces.
         step: depths are rounded to multiples of this step [m]; 0: depths are not rounded.
 
     Raises:
@@ -65,11 +66,11 @@ class DepthNoise:
         return np.asarray(np.hypot(axial, self.step / np.sqrt(12.0)) if self.step else axial)
 
     def apply(self, frame: DepthFrame, rng: np.random.Generator) -> DepthFrame:
-        """Return an image of the same surfaces with noise.
+        """Return the image with simulated noise in its depths.
 
         Args:
-            frame: an exact image.
-            rng: source of random numbers; the same state gives the same image.
+            frame: image with exact depths.
+            rng: random number generator; the same state of the generator gives the same noise.
         """
         instance(frame, DepthFrame, "DepthNoise.apply: frame")
         exact = frame.depth

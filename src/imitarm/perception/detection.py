@@ -23,7 +23,7 @@ _NEAREST = 1e-3  # [m] depth at which a camera's coordinates are still defined
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """The shape of an obstacle at the pose that a sensor measured.
+    """One measurement of an obstacle: its shape at the measured pose, and the uncertainty of the position.
 
     The measured position ``z`` is the origin of the obstacle's local frame (its centre, for most shapes). The error of
     ``z`` has zero mean and the covariance ``R``.
@@ -32,16 +32,16 @@ class Detection:
         obstacle: the shape at the measured pose in the base frame; its velocity is ignored. A half-space is not
             allowed, because it can't be tracked.
         covariance: covariance ``R`` of the measured position in the base frame, shape (3, 3) [m^2].
-        label: kind of object that the sensor recognised, for example a colour. Detections with different labels never
-            count as the same obstacle; an empty label matches every label.
+        label: what the sensor recognised, for example a colour; empty: nothing. Two detections with different labels
+            that are not empty never belong to the same obstacle.
         camera_to_base: pose of the camera that took the measurement. Only the extended Kalman filter uses it.
         solid: geometry of the obstacle, without pose and velocity.
-        row: position (3), covariance (9) and size (3) in one row, shape (15,). Each variance in the row is at least 1
-            nm^2, so that the covariance of an exact detection can be inverted.
+        row: position (3), covariance (9) and size (3) in one row, shape (15,). The row's variances are increased by 1
+            nm^2, so that the covariance matrix of an exact detection can be inverted.
 
     Raises:
-        InputError: when the obstacle can't be tracked, the covariance is not symmetric and positive semi-definite, or
-            the obstacle is behind the camera.
+        InputError: when the obstacle is a half-space or is behind the camera, or the covariance is not symmetric and
+            positive semi-definite.
     """
 
     obstacle: Obstacle
@@ -117,12 +117,12 @@ def resized(obstacle: Obstacle, size: Array) -> Obstacle:
 
 
 def estimated(obstacle: Obstacle, covariance: Array, track_id: int, name: str) -> Obstacle:
-    """Return a placed obstacle with covariance, track number and name.
+    """Return a copy of an obstacle with the given covariance, track number and name.
 
-    The values are not checked.
+    The function does not check its arguments.
 
     Args:
-        obstacle: detected obstacle, placed at its estimated pose, with its velocities.
+        obstacle: obstacle at its estimated pose, with its estimated velocities.
         covariance: covariance of the position, shape (3, 3) [m^2].
         track_id: number of the track.
         name: name of the returned obstacle.

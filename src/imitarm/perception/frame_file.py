@@ -26,12 +26,12 @@ _CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 
 @dataclass(frozen=True, eq=False)
 class FrameRecording:
-    """Recorded frames (images or point clouds) in the order of their stamps, for use in place of a camera.
+    """Recorded frames (depth images or point clouds), which can replace a camera.
 
     Iterate over a recording, or use :meth:`camera` as a camera of :class:`~imitarm.control_loop.CameraObserver`.
 
     Attributes:
-        frames: recorded frames; their stamps increase.
+        frames: recorded frames; each frame has a later stamp (time [s]) than the frame before it.
 
     Raises:
         InputError: when there is no frame, a frame is neither an image nor a point cloud, or the stamps do not
@@ -59,7 +59,7 @@ class FrameRecording:
         return len(self.frames)
 
     def at(self, time: float) -> Frame | None:
-        """Return the last frame with a stamp up to ``time`` [s]; None if there is no such frame."""
+        """Return the frame that was current at ``time`` [s]; None if ``time`` is before the first frame."""
         time = finite_number(time, "FrameRecording.at: time", "s")
         i = bisect_right([frame.stamp for frame in self.frames], time + 1e-9)
         return self.frames[i - 1] if i else None
@@ -111,7 +111,7 @@ class FrameRecording:
         """Read a recording.
 
         Raises:
-            FileFormatError: when the file is not a recording of frames; the message names the fault.
+            FileFormatError: when the file can't be read as a recording of frames.
         """
         path = file_path(path, "FrameRecording.load: path")
         try:

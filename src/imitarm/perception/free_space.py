@@ -1,4 +1,4 @@
-"""FreeSpace: which space a depth image shows to be empty, and which space may hide an obstacle."""
+"""FreeSpace: finds the space that a depth image shows to be empty, and the space in which an obstacle may be hidden."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ class FreeSpace:
 
     Each pixel of a depth image has a ray, which ends at the measured depth. A point is empty if the ray of its pixel
     ends behind the point. A point is hidden if it is behind a surface, outside of the image, or in a pixel without a
-    measurement. An obstacle may be at a hidden point. There is one exception. If a pixel and its eight neighbours
-    measured nothing, the surface is probably out of the camera's range, so the ray of this pixel counts as empty.
-    Points inside known objects, such as a table, belong to no obstacle and count as empty.
+    measurement. An obstacle may be at a hidden point. Exception: if a pixel and its eight neighbours have no
+    measurement, the surface is probably beyond the camera's range. All points on the ray of this pixel then count as
+    empty. Points inside known objects, such as a table, belong to no obstacle and count as empty.
 
     Args:
-        frame: depth image; None: no space is known to be empty or hidden, for example with a point cloud.
+        frame: depth image; None (for example, with a point cloud): only points inside the known objects count as empty,
+            and no point counts as hidden.
         surfaces: known objects that are not obstacles, such as the table.
         sigma: function that returns the standard deviation [m] of a depth [m].
     """
@@ -59,7 +60,7 @@ class FreeSpace:
             return empty | (measured > depth + margin + 3.0 * self._sigma(depth))
 
     def hidden(self, points: Array, margin: float = 0.01) -> Mask:
-        """Return whether points (..., 3) are behind a surface that the camera saw or outside of the image, shape (...).
+        """Return whether points (..., 3) are behind a measured surface or outside of the image, shape (...).
 
         Args:
             points: points in the base frame [m].
@@ -86,7 +87,7 @@ class FreeSpace:
         return np.where(inside, self._depth[pixel], -np.inf), z
 
     def below(self, points: Array, reach: float) -> Array:
-        """Return, for those ``points`` (n, 3) within ``reach`` [m] of a known surface, the nearest points on it [m]."""
+        """Project the points (n, 3) that are closer than ``reach`` [m] to a known surface onto this surface."""
         found = [np.zeros((0, 3))]
         for surface in self._surfaces:
             distance, normal = surface.distances_at(points, True)

@@ -17,19 +17,20 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class CoverageMargin:
-    """A margin ``m(tau) = a + b tau`` that bounds the error of a prediction over ``tau`` [s] with a given probability.
+    """A margin ``m(tau) = a + b tau`` [m] that bounds the error of a predicted position with a given probability.
 
-    The margin is added to the required clearance of an obstacle that is predicted ``tau`` seconds ahead. The margin is
-    calibrated by split conformal prediction. A *window* consists of one prediction and the true motion after the
-    prediction; its error at the look-ahead time ``tau_k`` is ``e(tau_k)``. One score is computed for each window::
+    The time ``tau`` [s] is the look-ahead time of the prediction. A policy adds the margin to the clearance that it
+    keeps from the predicted obstacle. The margin is calibrated by split conformal prediction. A *window* consists of
+    one prediction and the true motion after the prediction; its error at the look-ahead time ``tau_k`` is ``e(tau_k)``.
+    One score is computed for each window::
 
         s = max_k e(tau_k) / (a0 + b0 tau_k)
 
     With n independent windows and the coverage ``1 - alpha``, the margin is ``s* (a0 + b0 tau)``, where ``s*`` is the
-    ``ceil((n + 1) (1 - alpha))``-th smallest score. Then the error of a new window stays below the margin at all
-    look-ahead times with a probability of at least ``1 - alpha``. This holds for any distribution of the errors, if the
-    new window and the calibration windows are exchangeable. With several obstacles, ``alpha`` is divided by their
-    number, so that the coverage holds for all obstacles together.
+    ``ceil((n + 1) (1 - alpha))``-th smallest score. Then the error of a new window stays within the margin at all
+    look-ahead times with a probability of at least ``1 - alpha``. This guarantee holds for any distribution of the
+    errors. It requires that the new window is drawn like the calibration windows (that all windows are exchangeable).
+    With several obstacles, ``alpha`` is divided by their number, so that the coverage holds for all obstacles together.
 
     Attributes:
         offset: ``a``, margin at the time of the prediction [m].
@@ -83,16 +84,16 @@ class CoverageMargin:
         times: ArrayLike,
         shape: tuple[float, float] | None = None,
     ) -> CoverageMargin:
-        """Return the margin that bounds the errors of whole windows with the given probability.
+        """Calibrate a margin with measured errors, so that it holds with the probability ``coverage``.
 
         Args:
-            windows: prediction errors of independent windows, shape (n_windows, n_times) [m]; they should include the
-                error of the fitted shape.
+            windows: prediction errors of independent windows, shape (n_windows, n_times) [m]; the errors should include
+                the error of the obstacle's fitted shape.
             coverage: probability that all obstacles stay within their margins, between 0 and 1.
             n_obstacles: number of obstacles present at the same time.
             times: look-ahead times of the errors, shape (n_times,) [s]; at least 0.
-            shape: ``(a0, b0)``, offset and growth of the margin before scaling [m, m/s]. None: both are fitted to a
-                quarter of the windows, which are then left out of the calibration.
+            shape: ``(a0, b0)``, offset and growth of the margin before its scaling by ``s*`` [m, m/s]. None: a0 and b0
+                are fitted to a quarter of the windows, and ``s*`` is computed from the other windows.
 
         Raises:
             InputError: when an array has the wrong shape, a number is invalid, or there are too few windows for the
@@ -149,7 +150,7 @@ def conformal_quantile(values: Array, alpha: float) -> float:
 
 
 def fitted_shape(errors: Array, times: Array, alpha: float) -> tuple[float, float]:
-    """Fit a line ``a0 + b0 tau`` to the errors' ``1 - alpha`` quantile; return ``a0`` and ``b0``, both at least 0.
+    """Fit a line ``a0 + b0 tau`` to the errors' ``1 - alpha`` quantile; return ``a0 > 0`` and ``b0 >= 0``.
 
     Args:
         errors: prediction errors, shape (n_windows, n_times) [m].

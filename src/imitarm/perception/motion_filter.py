@@ -1,4 +1,4 @@
-"""MotionFilter: Kalman filters for many obstacles at once, with one or several models of their motion."""
+"""MotionFilter: Kalman filters of many obstacles, computed together, with one or several models of motion."""
 
 from __future__ import annotations
 
@@ -34,9 +34,10 @@ INITIAL_ACCELERATION = 2.0  # [m/s^2] standard deviation of each component of a 
 
 
 class Belief(NamedTuple):
-    """Gaussian estimates of the states of n obstacles, one for each of M models of motion.
+    """Gaussian estimates of the states of n obstacles; each obstacle has one estimate for each of M models of motion.
 
-    The state of an obstacle is ``[p; v]``, or ``[p; v; a]`` if any model has an acceleration.
+    The state of an obstacle contains its position p and velocity v, and its acceleration a if any model uses one. The
+    state has m = 6 or 9 components.
 
     Attributes:
         mean: mean of each state, shape (n, M, m) [m, m/s, m/s^2].
@@ -53,7 +54,7 @@ class Belief(NamedTuple):
         return Belief(self.mean[rows], self.covariance[rows], self.weights[rows])
 
     def replaced(self, rows: Indices, other: Belief) -> Belief:
-        """Return these beliefs, with the rows ``rows`` replaced by ``other``."""
+        """Return these beliefs, with the obstacles ``rows`` replaced by the obstacles of ``other``."""
         copied = Belief(*(x.copy() for x in self))
         for array, new in zip(copied, other, strict=True):
             array[rows] = new
@@ -77,14 +78,14 @@ class Measurements(NamedTuple):
     """Measured positions of obstacles, one row for each obstacle that was measured.
 
     A measurement of the position ``p`` is ``h(p) + noise``. Without ``rotations``, ``h(p)`` is ``p`` itself. With
-    ``rotations``, ``h(p)`` contains the camera coordinates ``(x/z, y/z, z)`` of the position; the extended Kalman
-    filter uses the Jacobian ``H`` of ``h``.
+    ``rotations``, ``h(p)`` is ``(x/z, y/z, z)``, where x, y and z are the coordinates of the position in the camera's
+    frame. The extended Kalman filter uses the Jacobian ``H`` of ``h``.
 
     Attributes:
         positions: measured positions in the base frame, shape (k, 3) [m].
         noise: covariances ``R`` of the measured positions, shape (k, 3, 3) [m^2].
-        rotations: base_to_camera rotations, shape (k, 3, 3); None: positions are measured directly. The rotation is nan
-            where a position was measured without a camera.
+        rotations: rotation from base to camera for each measurement, shape (k, 3, 3), nan for a measurement without a
+            camera; None: no measurement has a camera.
         origins: positions of the cameras, shape (k, 3) [m]; None without cameras.
     """
 
@@ -163,7 +164,7 @@ def inverse_3x3(matrices: Array) -> tuple[Array, Array]:
 
 
 class Innovation(NamedTuple):
-    """Innovations of k measurements (measured minus predicted values), and quantities computed from them.
+    """Innovations of k measurements (measured minus predicted values), with the matrices that a Kalman filter needs.
 
     Attributes:
         value: innovation ``nu``, shape (k, ..., 3).
@@ -211,19 +212,20 @@ class MotionFilter:
         F = [I, dt I; 0, I]        Q = q [dt^3/3 I, dt^2/2 I; dt^2/2 I, dt I]
         x <- F x                   P <- F P F' + Q
 
-    A model of order 2 assumes a constant acceleration. Its state also contains the acceleration, which white noise with
-    the spectral density ``q`` [m^2/s^5] disturbs. A measured position ``z`` with the covariance ``R`` changes the state
-    as follows, where ``H = [I, 0]``::
+    A model of order 2 assumes a constant acceleration. Its state also contains the acceleration. White noise with the
+    spectral density ``q`` [m^2/s^5] disturbs the acceleration. A measured position ``z`` with the covariance ``R``
+    changes the state as follows, where ``H = [I, 0]``::
 
         S = H P H' + R    K = P H' S^-1    x <- x + K (z - H x)    P <- (I - K H) P (I - K H)' + K R K'
 
-    An interacting multiple model (IMM) filter uses several models, and weights the models by the likelihood of the
-    measurements. Before each prediction, the states of the models are mixed, because an obstacle may change its model.
-    The IMM filter assumes that an obstacle changes its model after ``DWELL_TIME`` [s] on average.
+    An interacting multiple model (IMM) filter runs several models and weights them by the likelihood of the
+    measurements. Before each prediction, the filter mixes the states of the models, because the obstacle's motion may
+    change from one model to another. The IMM filter assumes that an obstacle changes its model after ``DWELL_TIME`` [s]
+    on average.
 
     Attributes:
-        orders: order of each model, that is, of the highest derivative in its state.
-        noise: spectral density ``q`` of each model.
+        orders: order of each model: 1 for constant velocity, 2 for constant acceleration.
+        noise: spectral density ``q`` of each model [m^2/s^3 for order 1, m^2/s^5 for order 2].
         initial_speed: standard deviation of each component of a new obstacle's velocity [m/s].
         size: number ``m`` of components of the state.
     """
@@ -304,14 +306,14 @@ class MotionFilter:
     def update(self, belief: Belief, measured: Measurements, innovation: Innovation | None = None) -> Belief:
         """Return the beliefs after each obstacle has been measured once.
 
-        The matrices with 3 rows or columns are padded to the size of the state, because products of small contiguous
-        square matrices are faster than products of parts of larger matrices.
+        The method pads the matrices with 3 rows or columns to the size of the state, because NumPy multiplies
+        contiguous matrices faster than parts of larger matrices.
 
         Args:
             belief: beliefs about k obstacles.
             measured: k measurements, one of each obstacle.
-            innovation: innovations of these measurements, if already computed from the combined mean and covariance.
-                They are used only if there is one model.
+            innovation: innovations of these measurements; None: they are computed. With several models, they are always
+                computed.
         """
         mean, P, weights = belief
         if innovation is None or len(self.orders) > 1:
@@ -375,7 +377,7 @@ def updated(
     gate: float,
     max_speed: float,
 ) -> tuple[Array, Array, Indices, Array] | None:
-    """Predict and update all tracks by compiled code; None without this code, or if the assignment is not obvious.
+    """Predict and update all tracks by compiled code; None if this code is missing or the assignment is ambiguous.
 
     The compiled code computes the same values as :meth:`MotionFilter.predict`, ``assign`` and
     :meth:`MotionFilter.update`.
@@ -385,14 +387,14 @@ def updated(
         covariance: covariances of these states, shape (n, 1, s, s).
         first: whether each track chooses its detection before the other tracks, shape (n,).
         dt: time from these states to the detections [s].
-        noise: spectral density of the process noise.
+        noise: spectral density of the process noise [m^2/s^3].
         rows: rows of m detections (:attr:`Detection.row`), shape (m, 15).
         gate: largest normalised innovation squared of a possible assignment.
         max_speed: largest speed [m/s].
 
     Returns:
-        New states and covariances of the same shapes; the index of each track's detection (n,), -1 for a track without
-        detection; and the normalised innovation squared of each track (n,), valid only for tracks with a detection.
+        New states and covariances of the same shapes; the index of each track's detection (n,), -1 for no detection;
+        the normalised innovation squared of each track (n,), meaningless for a track without a detection.
     """
     kernel = library()
     if kernel is None:

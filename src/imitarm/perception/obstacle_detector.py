@@ -64,17 +64,18 @@ class ObstacleDetector:
 
     The steps of :meth:`detect`:
 
-    1. Remove points out of the camera's range and mixed pixels at edges (:func:`segmentation.mixed_pixels`).
+    1. Remove points out of the camera's range, and pixels that measured a mixture of two surfaces
+    (:func:`segmentation.mixed_pixels`).
     2. Remove points outside of the workspace, on the known surfaces (table, floor, pedestal) and on the robot
        (:class:`SelfFilter`).
-    3. Group the remaining points: points that are separated only by small gaps belong to one object. A clearly concave
-       group is cut into two objects that touch each other, for example a hand and a bottle
-       (:func:`segmentation.best_cut`).
+    3. Divide the remaining points into groups at gaps that are wider than ``gap``; each group is one object. A clearly
+    concave group probably shows two objects that touch, for example a hand and a bottle. It is cut in two
+    (:func:`segmentation.best_cut`).
     4. Fit a sphere, a cylinder, a capsule, a box or a convex hull to each object, and compute the covariance of its
        position. Extend the shape into space that the camera can't see
        (:func:`~imitarm.perception.shape_choice.fit_shape`).
 
-    The fitted shapes are conservative: no visible point is outside of its shape by more than twice the noise.
+    No visible point of an object is outside of the fitted shape by more than two standard deviations of the noise.
 
     Args:
         arm: arm with its tool; points on both are removed. None: no robot is in view.
@@ -85,17 +86,18 @@ class ObstacleDetector:
             [m].
         depth_range: least and largest depth that the camera measures well [m].
         noise: noise of the camera, from which margins are computed; None: the noise of a Kinect.
-        surface_margin: points within this distance from a known surface belong to the surface [m]; the noise is added.
+        surface_margin: points within this distance from a known surface belong to the surface [m]; the detector adds
+            the noise of each point.
         padding: distance from the arm within which points belong to the arm [m], see :class:`SelfFilter`.
         stamp_uncertainty: uncertainty of the time stamps [s], see :class:`SelfFilter`.
         voxel: edge length of the voxels in which points are averaged [m].
-        gap: largest gap between two parts of one object [m]; where neighbouring rays are farther apart, larger gaps are
-            allowed.
+        gap: largest gap between two parts of one object [m]. Far from the camera, where neighbouring rays are farther
+            apart than this, the gap is larger.
         min_points: smallest number of points of an object; a smaller group counts as noise.
         shapes: shapes that may be fitted.
         split: whether clearly concave groups are cut into parts.
-        targets: known objects; if a detection matches a target, its label is the target's name. Points of a target's
-            colour form an object of their own, even if they touch another object. If the images have no colours, only
+        targets: known objects; if a detection matches a target, its label is the target's name. Points with the colour
+            of a target form a separate object, even if they touch another object. If the images have no colours, only
             shapes are compared.
         max_obstacles: largest number of detections; if there are more, the detections nearest to the camera are kept.
 
@@ -151,12 +153,12 @@ class ObstacleDetector:
         )
 
     def record(self, stamp: float, q: ArrayLike) -> None:
-        """Store the joint positions ``q`` (n_joints,) [rad] at ``stamp`` [s], for images taken at about this time."""
+        """Store the joint positions ``q`` (n_joints,) [rad] at ``stamp`` [s]; :meth:`detect` interpolates them."""
         if self.self_filter is not None:
             self.self_filter.record(stamp, q)
 
     def detect(self, frame: Frame, q: ArrayLike | None = None) -> list[Detection]:
-        """Return the obstacles in one image, the nearest to the camera first.
+        """Return the obstacles in one image, in the order of their distance from the camera.
 
         Args:
             frame: depth image or point cloud.
@@ -186,20 +188,20 @@ class ObstacleDetector:
         return [self._detection(part, space) for part in objects[: self.max_obstacles]]
 
     def obstacle_points(self, frame: Frame, q: ArrayLike | None = None) -> Array:
-        """Return the points that belong neither to the robot nor to a known surface, in the base frame, (n, 3) [m].
+        """Return all points except those of the robot and of the known surfaces, in the base frame, shape (n, 3) [m].
 
-        The arguments are those of :meth:`detect`.
+        The arguments have the same meaning as in :meth:`detect`.
         """
         if q is not None:
             self.record(frame.stamp, q)
         return self._obstacle_points(frame)[0].points
 
     def camera_error(self, frame: Frame) -> str:
-        """Return a message if the camera is not at the pose that the frame states; empty if no error is found.
+        """Check the pose of the camera that the frame states; return a message about an error, or an empty string.
 
-        If somebody has moved a camera, the known surfaces appear at wrong places. The function looks for two signs.
-        First, many rays go through known surfaces. Second, the measured plane of a half-space or of the upper face of a
-        box deviates from its known place by more than 3 cm or 4 degrees, and hardly any points are at the known place.
+        If somebody has moved a camera, the known surfaces appear at wrong places. The method reports two signs of this.
+        First, many rays go through known surfaces. Second, hardly any point lies on the plane of a known half-space or
+        on the upper face of a known box, and the measured plane is more than 3 cm or 4 degrees away from it.
 
         Args:
             frame: depth image or point cloud.

@@ -1,4 +1,4 @@
-"""PersonCapsules: a person's arms as obstacles; the camera that records a teacher thus also protects the teacher."""
+"""PersonCapsules: a person's arms as obstacles, so that the robot avoids the person whom the camera records."""
 
 from __future__ import annotations
 
@@ -23,19 +23,20 @@ class PersonCapsules:
     r"""Converts skeletons to detections: each arm becomes two capsules, an upper arm and a forearm with its hand.
 
     The capsule of the upper arm surrounds the segment from shoulder to elbow. The capsule of the forearm begins at the
-    elbow and ends at the farthest tracked point of the hand; if only the wrist is tracked, this capsule is extended by
-    the length of a hand. If the hand is bent, the radius of this capsule is enlarged until wrist, hand and thumb are
-    inside, each with half of its thickness.
+    elbow and ends at the farthest tracked point of the hand. If only the wrist is tracked, the capsule of the forearm
+    ends ``hand_length`` beyond the wrist. Its radius is enlarged until the tracked points of wrist, hand and thumb are
+    inside by at least ``hand_radius``.
 
-    Let :math:`\sigma_a` and :math:`\sigma_b` be the standard deviations of the two ends, which depend on whether the
-    camera tracks or infers the joints. The errors of the two ends are correlated, because most errors come from the
-    posture of the person. The middle of the capsule is therefore not more accurate than its ends, and its covariance is
+    Let :math:`\sigma_a` and :math:`\sigma_b` be the standard deviations of the two ends of a capsule. Each is
+    ``tracked_sigma`` or ``inferred_sigma``, because a skeleton camera states whether it tracked or only inferred a
+    joint. Both ends have similar errors, because most errors come from the posture of the person. The middle of the
+    capsule is therefore not more accurate than its ends, and the covariance of the middle is
 
     .. math:: R = \tfrac12 (\sigma_a^2 + \sigma_b^2)\, I
 
-    A capsule is left out if an end is lost, or if the ends are farther apart than possible; a tracker then predicts the
-    capsule. Each capsule has a label such as ``"person 0 right forearm"``, so that a tracker never confuses two
-    capsules.
+    There is no detection of a capsule if one of its ends is lost, or if its ends are farther apart than is possible for
+    a person. A tracker then predicts the capsule. Each capsule has a label such as ``"person 0 right forearm"``, so
+    that a tracker never confuses two capsules.
 
     Args:
         sensor_to_base: pose of the skeleton camera; the camera's frame is that of
@@ -45,8 +46,8 @@ class PersonCapsules:
         forearm_radius: smallest radius of the forearm's capsule [m].
         hand_length: distance from wrist to finger tips [m].
         hand_radius: half of the thickness of a hand [m].
-        tracked_sigma: standard deviation of a tracked joint [m].
-        inferred_sigma: standard deviation of an inferred joint [m].
+        tracked_sigma: standard deviation of the position of a tracked joint [m].
+        inferred_sigma: standard deviation of the position of an inferred joint [m].
 
     Raises:
         UnknownNameError: when a side is neither left nor right.
@@ -132,7 +133,8 @@ def upright_camera(position: ArrayLike, yaw: float = 0.0) -> Pose:
 
     Args:
         position: position of the camera in the base frame, shape (3,) [m].
-        yaw: rotation of the camera about the vertical [rad]. With 0, the camera looks along x; with pi, against x.
+        yaw: rotation of the camera about the vertical [rad]. With 0, the camera looks in the direction of x; with pi,
+            in the opposite direction.
 
     Raises:
         InputError: when a number is not finite.

@@ -16,14 +16,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PointCloud:
-    """Measured surface points that are not arranged in rows and columns as in an image.
+    """Measured points on surfaces, in any order and without the rows and columns of an image.
 
     Attributes:
         stamp: time at which the points were measured [s].
         measured: points in the sensor's frame, shape (n, 3) [m]; rows that are not finite are removed.
         sensor_to_base: pose of the sensor when the points were measured.
-        spacing: angle between neighbouring rays [rad]. The distance of a surface times this angle is the spacing of its
-            points.
+        spacing: angle between neighbouring rays [rad]. This angle times the distance of a surface from the sensor is
+            the distance between neighbouring points of the surface.
         colors: red, green and blue of each point, 0 to 1, shape (n, 3); None without colours.
 
     Raises:

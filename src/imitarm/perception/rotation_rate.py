@@ -1,4 +1,4 @@
-"""How fast tracked obstacles rotate: angular velocities from the measured rotations of successive detections."""
+"""Angular velocities of tracked obstacles, estimated from the rotations of successive detections."""
 
 from __future__ import annotations
 
@@ -22,22 +22,23 @@ _DOUBT = 4.0  # a rate is reduced by so many of its own variances
 
 
 class Rates(NamedTuple):
-    r"""Angular velocities of n obstacles, smoothed, with their scatter.
+    r"""Smoothed angular velocities of n obstacles, and the noise of each of them.
 
-    Two detections of an obstacle, ``dt`` apart, differ by the rotation vector ``theta``. Then
+    Let ``theta`` [rad] be the rotation vector between two successive detections of an obstacle, and ``dt`` [s] the time
+    between them. The smoothed angular velocity ``omega`` and the mean square ``s^2`` of its residual ``r`` are updated
+    by
 
     .. math::
         r = \theta / dt - \omega, \qquad \omega \leftarrow \omega + g\,r, \qquad
         s^2 \leftarrow s^2 + g\,(|r|^2 - s^2), \qquad g = dt / (dt + 0.03\,\mathrm{s})
 
-    The estimate has about the variance ``g / (2 - g) s^2``. If the measured rotations are noisy, the obstacle is
-    therefore reported to rotate with ``omega max(0, 1 - 4 g / (2 - g) s^2 / |omega|^2)``, which is 0 unless the
-    rotation is larger than its noise.
+    The variance of ``omega`` is about ``g / (2 - g) s^2``. The reported angular velocity is ``omega max(0, 1 - 4 g / (2
+    - g) s^2 / |omega|^2)``. It is 0 if ``|omega|`` is at most twice the standard deviation of ``omega``.
 
     Attributes:
-        omega: shape (n, 3) [rad/s].
-        scatter: s^2, shape (n,) [rad^2/s^2].
-        share: g of the last detection, shape (n,).
+        omega: smoothed angular velocities, shape (n, 3) [rad/s].
+        scatter: mean square s^2 of the residuals, shape (n,) [rad^2/s^2].
+        share: weight g of the last detection, shape (n,).
     """
 
     omega: Array
@@ -46,19 +47,19 @@ class Rates(NamedTuple):
 
     @classmethod
     def none(cls, n: int) -> Rates:
-        """Return n obstacles that do not rotate."""
+        """Return the rates of n obstacles that do not rotate."""
         return cls(np.zeros((n, 3)), np.zeros(n), np.zeros(n))
 
     def rows(self, rows: Indices) -> Rates:
-        """Return some of the obstacles."""
+        """Return the rates of the obstacles with the indices ``rows``."""
         return Rates(*(array[rows] for array in self))
 
     def joined(self, other: Rates) -> Rates:
-        """Return these obstacles, followed by others."""
+        """Return these rates, followed by the rates ``other``."""
         return Rates(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
 
     def seen(self, rows: Indices, turns: Array, dt: Array) -> Rates:
-        """Return the rates after the obstacles ``rows`` (k,) turned by ``turns`` (k, 3) [rad] in ``dt`` (k,) [s]."""
+        """Return the rates after the obstacles ``rows`` (k,) rotated by ``turns`` (k, 3) [rad] in ``dt`` (k,) [s]."""
         if not (turns.any() or self.omega[rows].any()):
             return self
         omega, scatter, share = (array.copy() for array in self)
@@ -74,7 +75,7 @@ class Rates(NamedTuple):
 
     @property
     def reported(self) -> Array:
-        """Angular velocities, reduced by their uncertainty, shape (n, 3) [rad/s]."""
+        """The angular velocities to report, see :class:`Rates`, shape (n, 3) [rad/s]."""
         if not self.omega.any():
             return self.omega
         squared = np.sum(self.omega * self.omega, axis=1)
@@ -83,15 +84,15 @@ class Rates(NamedTuple):
 
 
 def turned(kinds: Sequence[str], before: Array, now: Array) -> Array:
-    """Return the smallest rotations that explain two measured rotations of obstacles.
+    """Return the smallest rotation of each obstacle that leads from its first to its second measured rotation.
 
-    A rotation that leaves the shape as it is can't be seen: any rotation of a sphere, a rotation of a capsule about its
-    axis, or that of a box by 180 degrees.
+    No sensor sees a rotation that maps a shape onto itself: any rotation of a sphere, a rotation of a capsule about its
+    axis, or a rotation of a box by 180 degrees. Such a rotation counts as no rotation.
 
     Args:
         kinds: kinds of the shapes, of length k.
-        before: measured rotations, shape (k, 4).
-        now: rotations measured later, shape (k, 4).
+        before: rotations measured first, quaternions wxyz, shape (k, 4).
+        now: rotations measured later, quaternions wxyz, shape (k, 4).
 
     Returns:
         Rotation vectors in the base frame, shape (k, 3) [rad].
@@ -120,7 +121,7 @@ def _of_axis(before: Array, now: Array, both_ends: bool) -> Array:
 
 
 def turned_on(quaternions: Array, omega: Array, elapsed: Array) -> Array:
-    """Return rotations (n, 4) after rotating with ``omega`` (n, 3) [rad/s] for ``elapsed`` (n,) [s]."""
+    """Return quaternions (n, 4) after a rotation with ``omega`` (n, 3) [rad/s] for ``elapsed`` (n,) [s]."""
     if not omega.any():
         return quaternions
     return quaternion_multiply(quaternion_exp(elapsed[:, None] * omega), quaternions)

@@ -23,7 +23,7 @@ _TRIALS = 200  # planes that fit_plane tries
 
 
 def mixed_pixels(depth: Array, jump: float = 0.04) -> Mask:
-    """Return whether each pixel measures a mixture of two surfaces, and thus a depth at which there is no object.
+    """Return whether each pixel measured a mixture of two surfaces, so that no surface is at the measured depth.
 
     At the edge of an object, part of the light of a pixel comes from the object and part from the background. The depth
     of such a pixel lies between the depths of its two neighbours in a row or column, and differs from each by more than
@@ -31,7 +31,7 @@ def mixed_pixels(depth: Array, jump: float = 0.04) -> Mask:
 
     Args:
         depth: depth image, shape (height, width) [m]; nan where nothing was measured.
-        jump: smallest difference from each of the two neighbours [m].
+        jump: smallest difference of a mixed pixel's depth from the depth of each of the two neighbours [m].
     """
     mixed = np.zeros(depth.shape, dtype=bool)
     for values, result in ((depth, mixed), (depth.T, mixed.T)):
@@ -62,10 +62,10 @@ def fit_plane(
         tolerance: largest distance of a point that belongs to the plane [m].
         max_tilt: largest angle between the plane's normal and ``normal`` [rad].
         least_fraction: smallest fraction of all points that must belong to the plane.
-        seed: seed of the random choices.
+        seed: seed of the random number generator.
 
     Returns:
-        A half-space with all points below the plane; None when there is no such plane.
+        The half-space below the plane; None if no plane contains enough of the points.
 
     Raises:
         InputError: when an argument can't be used.
@@ -128,7 +128,7 @@ def connected(points: Array, gaps: Array) -> Indices:
 
     Args:
         points: measured points, shape (n, 3) [m].
-        gaps: largest distance to a neighbour, for each point, shape (n,) [m].
+        gaps: gap of each point, shape (n,) [m].
     """
     n = len(points)
     if n == 0:
@@ -143,10 +143,10 @@ def connected(points: Array, gaps: Array) -> Indices:
 
 
 def depth_in_hull(points: Array) -> Array:
-    """Return the depth of each point inside the convex hull of all points, shape (n,) [m].
+    """Return how deep each point is inside the convex hull of all points, shape (n,) [m].
 
-    The visible points of a convex object are on the object's surface, so none of them is deep inside the hull. Points
-    deep inside the hull therefore show a concave object, or two objects that touch.
+    The visible points of a convex object are on the object's surface, so none of them is deep inside the hull. If there
+    are points deep inside the hull, the object is therefore concave, or there are two objects that touch.
     """
     try:
         equations = Qhull(points).equations
@@ -156,7 +156,7 @@ def depth_in_hull(points: Array) -> Array:
 
 
 def concavity(points: Array) -> float:
-    """Return the 90th percentile of the points' depths inside their hull [m]; 0 for few points or points in a plane."""
+    """Return the 90th percentile of :func:`depth_in_hull` [m]; 0 for fewer than 8 points or points in a plane."""
     if len(points) < 8:
         return 0.0
     place = 0.9 * (len(points) - 1)
@@ -168,16 +168,16 @@ def concavity(points: Array) -> float:
 def best_cut(points: Array, origin: Array) -> tuple[Mask, float]:
     """Find the plane that cuts a cluster into the two most convex parts.
 
-    Planes perpendicular to the principal axes, to the vertical and to two horizontal directions are tried, each at
-    several positions along its normal.
+    The function tries five directions of the plane's normal: the three principal axes of the points, the vertical, and
+    the horizontal direction across the line of sight. It tries several positions of the plane along each normal.
 
     Args:
         points: points of the cluster, shape (n, 3) [m].
         origin: position of the camera, shape (3,) [m].
 
     Returns:
-        Whether each point is on the first side of the plane, shape (n,); and the mean concavity of the two sides,
-        weighted by their numbers of points [m].
+        Whether each point is on the first side of the plane, shape (n,); and the mean of the two sides' concavities
+        (:func:`concavity`), weighted by their numbers of points [m].
     """
     sample = points[np.linspace(0, len(points) - 1, min(len(points), _SEARCHED)).astype(int)]
     center = sample.mean(axis=0)

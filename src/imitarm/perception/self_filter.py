@@ -22,10 +22,10 @@ class SelfFilter:
 
     .. math:: |p - c| \le r + d + |v|\,\delta
 
-    The padding :math:`d` covers errors of the calibration and of the measurement. The uncertainty of the time stamps is
-    :math:`\delta`: if a stamp is wrong by 33 ms, a link that moves at 1 m/s is displaced by 33 mm. The joint positions
-    are interpolated between the recorded values. The filter also removes points of an obstacle that is closer to the
-    arm than the padding, so the padding should be small.
+    The padding :math:`d` covers errors of the calibration and of the measurement. The time :math:`\delta` is the
+    uncertainty of the time stamps: if a stamp is wrong by 33 ms, a link that moves at 1 m/s appears 33 mm away from its
+    true position. The filter also removes the points of an obstacle that is closer to the arm than the padding.
+    Therefore, the padding should be small.
 
     Args:
         arm: arm with its tool.
@@ -52,7 +52,7 @@ class SelfFilter:
     def record(self, stamp: float, q: ArrayLike) -> None:
         """Store the joint positions of the arm at one time.
 
-        Joint positions may arrive in any order. If two have the same stamp, the second replaces the first.
+        Joint positions may arrive in any order. Of two records with the same stamp, the second replaces the first.
 
         Args:
             stamp: time of the joint positions [s].
@@ -82,8 +82,8 @@ class SelfFilter:
     def posture(self, time: float) -> Array:
         """Return the joint positions at ``time`` [s], interpolated between recorded positions, shape (n_joints,) [rad].
 
-        Before the first record, the first joint positions are returned. After the last record, the joints are assumed
-        to keep their velocity for up to ``stamp_uncertainty``, and then to stand still.
+        Before the first record, the first joint positions are returned. After the last record, the joint positions are
+        extrapolated with the last velocity for at most ``stamp_uncertainty`` seconds, and then stay constant.
         """
         stamps = self._stamps
         if not stamps:

@@ -1,4 +1,4 @@
-"""Chooses a shape that fits the visible points of an object, and extends it over parts that the camera can't see."""
+"""Chooses a shape for the visible points of an object, and extends the shape to parts that the camera can't see."""
 
 from __future__ import annotations
 
@@ -34,26 +34,27 @@ def fit_shape(
 ) -> Detection:
     r"""Fit shapes of all kinds, choose the best shape, and extend it to parts that may be hidden.
 
-    Let ``s`` be the root mean square of the distances of ``n`` points to the surface of a fitted shape with ``k``
-    parameters, but at least the standard deviation of the measurement. The shape with the smallest value of the
-    Bayesian information criterion is chosen, which is
+    Let ``s`` be the root mean square distance of the points from the surface of a shape with ``k`` parameters. ``s`` is
+    at least the standard deviation of the measurement. Neighbouring points have similar errors, so ``n`` is a quarter
+    of the number of points. The function chooses the shape with the smallest value of the Bayesian information
+    criterion
 
     .. math:: n \log s^2 + k \log n
 
     A shape is rejected if more than a quarter of its surface lies in space that the camera saw to be empty. If every
-    shape is rejected, or if the distances to the best shape are far above the noise, the convex hull of the points is
-    used. A radius is enlarged by its standard deviation, or by up to three standard deviations if the object appears
-    wider in the image.
+    shape is rejected, or if the points are much farther from the best shape than the noise explains, the convex hull of
+    the points is used. The radius of a sphere, cylinder or capsule is enlarged by its standard deviation. If the object
+    appears wider than that in the image, the radius is enlarged by up to three standard deviations.
 
-    Then the shape is extended at the ends and faces that the camera did not see, until it reaches empty space. The
+    Then the ends and faces that the camera did not see are moved outwards, until the shape reaches empty space. The
     extension is at most the size of the visible part, and at most 0.3 m. Finally, the shape is enlarged until no
     visible point is outside by more than twice the standard deviation of the noise.
 
-    The covariance of the position is a sum of four terms. The first two result from the noise of the points and from
-    the distance between neighbouring rays. The third corresponds to a standard deviation of a twentieth of the size,
-    because no object has exactly the fitted shape. The fourth results from the unknown size of the hidden part: a side
-    that was extended by ``g`` may in truth end anywhere in the extension. The true centre may therefore be displaced by
-    up to ``g / 2``, with a root mean square of ``g / sqrt(12)``.
+    The covariance of the position is a sum of four terms. The first term results from the noise of the points, and the
+    second from the distance between neighbouring rays. The third term corresponds to a standard deviation of a
+    twentieth of the size, because no object has exactly the fitted shape. The fourth term results from the unknown size
+    of the hidden part. A side that was moved outwards by ``g`` may in truth end anywhere in between. The fourth term
+    therefore contains ``g^2 / 12`` for each such side.
 
     Args:
         visible: points to which the shapes are fitted.
@@ -95,7 +96,7 @@ def fit_shape(
 
 
 def candidates(visible: Visible, kind: str) -> list[Fit]:
-    """Return the fits of one kind of shape, one fit for each possible direction of its axis."""
+    """Fit one kind of shape; return one fit for each possible direction of the shape's axis."""
     if kind == "sphere":
         fit = shape_fit.sphere(visible)
         return [] if fit is None else [fit]
@@ -106,7 +107,7 @@ def candidates(visible: Visible, kind: str) -> list[Fit]:
 
 
 def axes(visible: Visible) -> list[Array]:
-    """Return possible axes of a cylinder or capsule: perpendicular to all normals, along the longest side, vertical."""
+    """Return possible axes of a cylinder or capsule: across all normals, along the longest side, and the vertical."""
     normals, points = visible.normals, visible.points - visible.points.mean(axis=0)
     least = np.linalg.eigh(normals.T @ normals)[1][:, 0]
     longest = np.linalg.eigh(points.T @ points)[1][:, 2]
@@ -177,7 +178,8 @@ def grow(obstacle: Obstacle, visible: Visible, space: FreeSpace) -> tuple[Obstac
         space: the space that the camera saw to be empty.
 
     Returns:
-        The extended shape; and the covariance of its position that results from the unknown size, shape (3, 3) [m^2].
+        The extended shape; and the part of its position's covariance that results from the unknown size, shape (3, 3)
+        [m^2].
     """
     if isinstance(obstacle, Box):
         return _grow_box(obstacle, visible, space)

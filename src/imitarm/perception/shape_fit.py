@@ -45,7 +45,7 @@ class Visible(NamedTuple):
 
     @classmethod
     def of(cls, points: Array, origin: Array, sigma: float, spacing: float) -> Visible:
-        """Estimate the normals, and return the points together with the normals."""
+        """Return visible points with estimated normals; the arguments are the attributes of the class."""
         return cls(points, point_normals(points, origin), origin, sigma, spacing)
 
 
@@ -54,10 +54,10 @@ class Fit(NamedTuple):
 
     Attributes:
         obstacle: the fitted shape.
-        covariance: covariance of the position if the residuals were one metre, shape (3, 3): the block of
-            ``(J^T J)^-1`` that belongs to the position, with the Jacobian J of the residuals. For a hull, the
-            covariance itself [m^2].
-        radius: standard deviation of the radius if the residuals were one metre; 0 for shapes without a radius.
+        covariance: block of ``(J^T J)^-1`` that belongs to the position, shape (3, 3). J is the Jacobian of the
+            residuals; the residuals' variance times this block is the covariance of the position. For a hull, this is
+            the covariance itself [m^2].
+        radius: standard deviation of the radius divided by that of the residuals; 0 for shapes without a radius.
         outline: half of the object's width as the camera sees it [m]; 0 for shapes without a radius.
     """
 
@@ -86,7 +86,7 @@ def point_normals(points: Array, origin: Array) -> Array:
 
 
 def sphere(visible: Visible) -> Fit | None:
-    """Fit a sphere (centre ``c``, radius ``r``): minimise the squares of ``|p - c| - r`` over all points ``p``."""
+    """Fit a sphere with centre ``c`` and radius ``r``: minimise the sum of ``(|p - c| - r)^2`` over all points p."""
     points = visible.points
     shift = points.mean(axis=0)
     p = points - shift
@@ -112,8 +112,8 @@ def cylinders(visible: Visible, axes: Array) -> list[Fit]:
     """Fit cylinders, starting from several directions ``axes`` (k, 3) of the axis.
 
     A point whose normal is perpendicular to the axis lies on the curved side; these points determine axis and radius. A
-    point whose normal is parallel to the axis lies on a flat end. If there are no such points, the outermost points
-    determine the end.
+    point whose normal is parallel to the axis lies on a flat end and determines the position of this end. If no point
+    lies on an end, the outermost points along the axis determine its position.
     """
     bars = _round_bars(visible, axes, np.abs(axes @ visible.normals.T) < 0.6)
     fits = []
@@ -181,9 +181,9 @@ def capsules(visible: Visible, axes: Array) -> list[Fit]:
 def box(visible: Visible, axis: Array) -> Fit:
     """Fit a box of which one edge is parallel to ``axis`` (3,).
 
-    The rotation about the axis minimises the mean distance of the points to the nearest face that the camera can see
-    (*L-shape fitting*: Zhang, Xu, Dong and Dolan, IV 2017). The position of a visible face is the mean of its points.
-    The other faces are placed at the outermost points.
+    The function chooses the rotation about ``axis`` with the smallest mean distance between the points and the nearest
+    visible face (*L-shape fitting*: Zhang, Xu, Dong and Dolan, IV 2017). The position of a visible face is the mean of
+    its points. The other faces are placed at the outermost points.
     """
     e1, e2 = np.concatenate(basis_across(axis[None]))
     local = np.column_stack([visible.points @ e1, visible.points @ e2, visible.points @ axis])
@@ -210,11 +210,11 @@ def box(visible: Visible, axis: Array) -> Fit:
 
 
 def hull(visible: Visible, unseen: Array | None = None) -> Fit:
-    """Fit a convex hull: enclose the points, and a mirrored copy of the points that represents the unseen back.
+    """Fit a convex hull: enclose the visible points and their mirror image, which represents the hidden back.
 
-    The back of a convex object begins at the outline that the camera sees. The points are therefore mirrored in a plane
-    that is perpendicular to the line of sight, just behind the farthest points. The hull is at least as deep as the
-    smallest width of the object in the image, so that even a single flat face becomes a solid.
+    The back of a convex object begins at the outline that the camera sees. The mirror plane is therefore perpendicular
+    to the line of sight and just behind the farthest points. The hull is at least as deep as the smallest width of the
+    object in the image, so that even a single flat face becomes a solid.
 
     Args:
         visible: the visible points of the object.
@@ -241,8 +241,8 @@ def centered_hull(points: Array) -> ConvexHull:
     """Return the hull of points (n, 3) [m]; the origin of its local frame is near the centroid of its volume.
 
     The class ConvexHull places the local frame at the mean of the given points. The mean of all measured points would
-    depend on how densely the camera sampled each side. Therefore only the corners of the hull are given, together with
-    as many copies of a point in the middle.
+    depend on how densely the camera sampled each side. Therefore, this function passes only the corners of the hull,
+    together with many copies of a point in its middle.
     """
     corners = ConvexHull(points).vertices
     center = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
@@ -359,7 +359,7 @@ def _best_yaw(local: Array, eye: Array, yaws: Array) -> float:
 
 
 def basis_across(axes: Array) -> tuple[Array, Array]:
-    """Return two unit vectors (k, 3) that are perpendicular to each of ``axes`` (k, 3) and to each other.
+    """Return two unit vectors for each of ``axes`` (k, 3), perpendicular to the axis and to each other: two (k, 3).
 
     The formula is from Duff et al., *Building an orthonormal basis, revisited*, JCGT 2017.
     """

@@ -1,13 +1,13 @@
-r"""The velocity of a tracked obstacle, measured over a longer time than a tracker does.
+r"""The mean velocity of a tracked obstacle over up to one second, which is less noisy than the tracker's velocity.
 
-A tracker must follow sudden changes, so its velocities are noisy. An error of 5 cm/s becomes 25 cm after five seconds,
-and plans look that far ahead. If an obstacle moves steadily, its places now and at the earlier time :math:`t - W`
-give a better velocity:
+A tracker must follow sudden changes, so its velocities are noisy. A plan may look five seconds ahead; an error of 5
+cm/s then becomes an error of 25 cm. If an obstacle moves at a constant velocity, its positions p at the times :math:`t`
+and :math:`t - W` give a better velocity:
 
 .. math:: v_W = \frac{p(t) - p(t - W)}{W}
 
-With errors of 5 mm and W = 1 s, the error of :math:`v_W` is 7 mm/s. An obstacle counts as steady while :math:`v_W` and
-the velocity of the tracker differ by less than the tracker's usual error.
+If each position has an error of 5 mm and W is 1 s, the error of :math:`v_W` is 7 mm/s. An obstacle counts as steady
+while :math:`v_W` and the tracker's velocity differ by at most 0.12 m/s, which is the tracker's usual error.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ _STANDS = 0.015  # [m/s] an obstacle that is slower than this counts as standing
 
 
 class SteadyVelocities:
-    """Replaces the velocities of steady tracked obstacles by velocities over a longer time.
+    """Replaces the velocities of steady tracked obstacles by their mean velocities over up to one second.
 
-    Obstacles without a track number keep their velocities, because those are given and not estimated.
+    Obstacles without a track number keep their velocities, because no tracker estimated these velocities.
     """
 
     def __init__(self) -> None:
         self._places: dict[int, deque[tuple[float, Array]]] = {}
 
     def improved(self, scene: Scene) -> Scene:
-        """Return a scene with improved velocities, and remember where its obstacles are.
+        """Return the scene with improved velocities, and store the positions of its obstacles for later calls.
 
         Args:
-            scene: the obstacles at the time ``scene.stamp``. Later calls must have later stamps.
+            scene: scene from a tracker. Its stamp must be later than the stamp of the previous call.
         """
         packed, time = scene.packed, scene.stamp
         tracks = np.asarray(packed.track_ids).tolist()

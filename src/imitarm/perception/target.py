@@ -19,11 +19,12 @@ _BRIGHTNESS = 0.45  # largest difference of the mean of the three colours
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A known object; the ``label`` of each matching detection becomes the name of the object.
+    """A known object. A detection that matches the object gets the object's name as its ``label``.
 
-    The chromaticity of a colour consists of red, green and blue, each divided by their sum. It depends little on the
-    brightness of the light. A colour matches if its chromaticity is close to the chromaticity of the target. A shape
-    matches if it is of the same kind as the target's shape, and no length differs by more than ``size_tolerance``.
+    The chromaticity of a colour consists of its red, green and blue, each divided by the sum of the three. The
+    chromaticity depends little on the brightness of the light. A colour matches if its chromaticity is close to the
+    chromaticity of the target. A shape matches if it is of the same kind as the target's shape, and no length differs
+    by more than ``size_tolerance``.
 
     Attributes:
         name: name of the object, which becomes the label of matching detections.

@@ -41,57 +41,57 @@ class _Step(NamedTuple):
 class ObstacleTracker:
     """Tracks many obstacles with Kalman filters: computes positions, velocities and covariances from detections.
 
-    The motion is predicted with thesis Eq 5.2, without the unknown input ``B u`` and with the noise as a covariance.
-    :class:`~imitarm.perception.motion_filter.MotionFilter` lists the equations. Each time step is the difference
-    between two time stamps.
+    Thesis Eq 5.2 predicts the motion, here without the unknown input ``B u`` and with noise of a given covariance.
+    :class:`~imitarm.perception.motion_filter.MotionFilter` lists the equations.
 
     1. *Assignment.* The innovation ``nu`` is the measured minus the predicted position, with the covariance ``S``. A
-       detection can belong to a track if ``d^2 = nu' S^-1 nu`` is at most the ``gate`` quantile of the chi-square
-       distribution. Detections are assigned to confirmed tracks first.
+    detection can belong to a track if ``d^2 = nu' S^-1 nu`` is at most a limit, the gate. This limit is the quantile of
+    the chi-square distribution for the probability ``gate``. Confirmed tracks get their detections before the other
+    tracks do.
     2. *Birth.* Every detection that was not assigned starts a new track. The track is confirmed if at least
-       ``confirm[0]`` of its first ``confirm[1]`` updates had a detection. Until then, the track is not reported.
+       ``confirm[0]`` of its first ``confirm[1]`` updates had a detection. Only confirmed tracks are reported.
     3. *Death.* A track without a detection continues at its velocity, and its covariance grows. The track ends when it
        has had no detection for more than ``max_unseen`` seconds.
     4. *Latency.* ``scene(time)`` predicts all tracks from the time of the last detections to ``time``. This prediction
        compensates the latency of the sensor (thesis Eqs 5.3 and 5.4 give the predicted positions and their
        covariances).
 
-    **Late detections.** Detections may arrive out of order. If an update is late by at most ``history`` seconds, it is
-    inserted at its own time, and all later updates are computed again. The result is therefore the same as if all
-    updates had arrived in order. An update that is later by more than ``history`` is ignored, and :attr:`ignored`
-    counts it as ``"late"``.
+    **Late detections.** Detections may arrive out of order. If an update is at most ``history`` seconds older than the
+    newest update, the tracker inserts it and repeats all updates after it. The result is therefore the same as if all
+    updates had arrived in order. Older updates are ignored, and :attr:`ignored` counts them as ``"late"``.
 
     **Other imperfect input.** :attr:`ignored` also counts three other cases. A second update with the same stamp and
-    the same detections is ignored (``"repeated"``). If two detections of one update differ insignificantly and one is
-    inside the other, they count as one obstacle, and only the more accurate detection is used (``"duplicate"``). If
-    there are more than ``max_obstacles`` tracks, the tracks with the oldest detections are removed (``"removed"``). A
-    detection that jumps out of the gate starts a new track. More than ``max_obstacles`` detections in one update are an
-    error, and no track changes.
+    the same detections is ignored (``"repeated"``). Two detections of one update are duplicates if their positions may
+    be equal and one shape is inside the other. Then only the more accurate detection is used (``"duplicate"``). If
+    there are more than ``max_obstacles`` tracks, the tracks with the oldest detections are removed (``"removed"``).
+    More than ``max_obstacles`` detections in one update are an error, and no track changes.
 
-    **Consistency.** :attr:`consistency` compares the innovations with their covariance. If the mean is above the band,
-    the detections are noisier than their covariance states, or ``process_noise`` is too small.
+    **Consistency.** :attr:`consistency` compares the mean of ``d^2`` with the band in which it lies for correct
+    covariances. If the mean is above the band, the detections are noisier than their covariance states, or
+    ``process_noise`` is too small.
 
     **Rotation.** A track has the rotation of its last detection. With ``rotations``, its angular velocity is estimated
     from the rotations of its detections (:class:`~imitarm.perception.rotation_rate.Rates`). Sizes are averaged over the
     detections.
 
     Args:
-        motion: model of the motion: ``"constant-velocity"``, ``"constant-acceleration"``, ``"imm"`` (both models,
-            weighted by their likelihoods) or ``"ekf"``. With ``"ekf"``, the velocity is constant, and positions are
-            measured in the coordinates of the camera (:attr:`Detection.camera_to_base`).
+        motion: model of the motion: ``"constant-velocity"``, ``"constant-acceleration"``, ``"imm"`` or ``"ekf"``.
+            ``"imm"`` (interacting multiple model) combines the first two models, weighted by their likelihoods.
+            ``"ekf"`` (extended Kalman filter) assumes a constant velocity and positions measured in the camera's frame
+            (:attr:`Detection.camera_to_base`).
         process_noise: spectral density of the noise that disturbs the velocity [m^2/s^3] or, with constant
             acceleration, the acceleration [m^2/s^5]; two numbers for ``"imm"``. None: 0.05 for constant velocity, 1 for
             constant acceleration, (0.02, 30) for ``"imm"``.
-        gate: probability that a detection of the tracked obstacle is within the gate.
-        confirm: (hits, updates): a track is confirmed after this number of hits in its first updates; a hit is an
-            update with a detection.
+        gate: probability that a correct detection of a tracked obstacle is within the gate.
+        confirm: two numbers (hits, updates): a track is confirmed if at least ``hits`` of its first ``updates`` updates
+            had a detection of the obstacle.
         max_unseen: time after the last detection at which a track ends [s].
         max_speed: largest speed of an obstacle [m/s]; a larger estimate is scaled down.
         max_obstacles: largest number of tracks, and of detections in one update.
         initial_speed: standard deviation of each component of a new track's velocity [m/s].
-        history: time for which late detections are accepted [s].
-        rotations: whether angular velocities are estimated; otherwise they are 0. Plans with a certificate replace a
-            rotating obstacle by a sphere around it.
+        history: largest age of a late update, relative to the newest update [s].
+        rotations: whether angular velocities are estimated; otherwise they are 0. If they are estimated, a policy that
+            guarantees clearance plans around the sphere that encloses a rotating obstacle.
 
     Raises:
         InputError: when an argument is out of its range.
@@ -126,7 +126,7 @@ class ObstacleTracker:
         self.reset()
 
     def reset(self) -> None:
-        """Delete all tracks and counts; track numbers start from 0 again."""
+        """Delete all tracks and all counts of :attr:`ignored`; track numbers start from 0 again."""
         self.ignored: Counter[str] = Counter()
         self._steps: deque[_Step] = deque()
         self._distances: deque[Array] = deque(maxlen=_RECENT)
@@ -188,9 +188,9 @@ class ObstacleTracker:
     def scene(self, time: float, *, goal: Pose | None = None, fixtures: Sequence[Obstacle] = ()) -> Scene:
         """Return a scene whose obstacles are the confirmed tracks, predicted to ``time``.
 
-        Each obstacle has the predicted position and velocity, the covariance of this position at ``time``, and the
-        number of its track. ``packed.stamps`` contains the time of the last detection of each obstacle. A track stays
-        in the scene until an update ends the track, so obstacles do not disappear while no updates arrive.
+        Each obstacle has its predicted position and velocity, the covariance of the predicted position, and the number
+        of its track. The scene's ``packed.stamps`` contains the time of the last detection of each obstacle. Only an
+        update can end a track, so obstacles do not disappear while no updates arrive.
 
         Args:
             time: time to which the obstacles are predicted, and stamp of the scene [s].

@@ -1,4 +1,4 @@
-"""Tracks: the state of a tracker at one time, as arrays. TrackedObstacle: a view of one track."""
+"""Tracks: the state of a tracker at one time, as arrays. TrackedObstacle: one track of a Tracks object."""
 
 from __future__ import annotations
 
@@ -24,22 +24,24 @@ UNCONFIRMED = -1  # the number of a track that is not confirmed yet
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """The state of n tracks at one time, one row for each track; a Tracks object never changes.
+    """The state of n tracks at one time, with one row for each track. The object is immutable.
 
     Attributes:
-        filter: Kalman filters that compute the beliefs.
-        stamp: time of the beliefs [s].
-        belief: estimated position, velocity (and acceleration) of each obstacle, with covariances.
-        ids: number of each track, shape (n,); ``UNCONFIRMED`` until the track is confirmed.
+        filter: Kalman filters of the tracks.
+        stamp: time of the state [s].
+        belief: estimated state of each obstacle (position, velocity and, for some filters, acceleration) with its
+            covariance.
+        ids: number of each track, shape (n,); ``UNCONFIRMED`` for a track that is not confirmed yet.
         last_seen: time of the last detection of each track, shape (n,) [s].
-        hits: the last updates of each track as bits of a number, shape (n,); a bit is 1 if the update had a detection.
+        hits: one whole number for each track, shape (n,). Each bit of the number stands for one of the last updates,
+            and is 1 if the track had a detection in this update.
         ages: number of updates since the track began, shape (n,).
         sizes: size of each shape, averaged over detections, shape (n, 3) [m].
         counts: number of detections over which each size is averaged, shape (n,).
-        rates: angular velocity of each obstacle, with its scatter.
+        rates: angular velocity of each obstacle, with its noise.
         detections: last detection of each track, n entries.
         labels: last label of each track that was not empty, n entries.
-        next_id: number of the next track that is confirmed.
+        next_id: number for the track that is confirmed next.
     """
 
     filter: MotionFilter
@@ -122,19 +124,19 @@ class Tracks:
         return self.belief.combined()
 
     def alike(self, detections: tuple[Detection, ...]) -> bool:
-        """Whether each track has its shape and no label in ``detections``, which are in the order of the tracks."""
+        """Whether each detection, in the order of the tracks, has the track's kind of shape and an empty label."""
         return not any(
             d.label or d.solid.kind != t.solid.kind for d, t in zip(detections, self.detections, strict=True)
         )
 
     def all_seen(self, detections: tuple[Detection, ...], sizes: Array, rates: Rates, window: int) -> Tracks:
-        """Return confirmed tracks after a detection of each of them; see :meth:`alike`.
+        """Return the tracks after an update with one detection of each track; all must be confirmed and :meth:`alike`.
 
         Args:
-            detections: in the order of the tracks.
+            detections: one detection of each track, in the order of the tracks.
             sizes: measured sizes, shape (n, 3) [m].
-            rates: new angular velocities.
-            window: number of updates that ``hits`` remembers.
+            rates: angular velocities after this update.
+            window: number of updates that ``hits`` stores.
         """
         counts = self.counts + 1
         seen = self.changed(
@@ -150,7 +152,7 @@ class Tracks:
         return seen
 
     def shapes(self, rows: Indices) -> tuple[object, ...]:
-        """Return what does not change while tracks only move: number, name, shape and size of each of them."""
+        """Return number, name, shape and size of each track; equal results mean that the tracks have only moved."""
         parts: list[object] = [self.sizes[rows].tobytes()]
         for row, track_id in zip(rows.tolist(), self.ids[rows].tolist(), strict=True):
             detection = self.detections[row]
@@ -164,12 +166,12 @@ class Tracks:
         return tuple(parts)
 
     def quaternions(self, rows: Indices) -> Array:
-        """Return the rotations (k, 4) that were detected last."""
+        """Return the rotations of the last detections, quaternions wxyz, shape (k, 4)."""
         return np.array([self.detections[row].solid.quaternion for row in rows.tolist()]).reshape(-1, 4)
 
     @cached_property
     def reported_rates(self) -> Array:
-        """Angular velocity of each obstacle, reduced by its uncertainty, shape (n, 3) [rad/s]."""
+        """Angular velocity of each obstacle, 0 if it is not larger than its noise, shape (n, 3) [rad/s]."""
         return self.rates.reported
 
     @cached_property
@@ -233,7 +235,7 @@ class TrackedObstacle:
 
     @property
     def angular_velocity(self) -> Array:
-        """Estimated angular velocity, shape (3,) [rad/s]; 0 unless it is larger than its noise."""
+        """Estimated angular velocity, shape (3,) [rad/s]; 0 if it is not larger than its noise."""
         return self.tracks.reported_rates[self.row]
 
     @property
@@ -245,8 +247,8 @@ class TrackedObstacle:
     def obstacle(self) -> Obstacle:
         """The obstacle at ``stamp``, with velocity, covariance of the position, track number and name.
 
-        The size is averaged over the detections. The rotation is that of the last detection, rotated on since then with
-        the estimated angular velocity.
+        The size is averaged over the detections. The rotation is the rotation of the last detection, predicted to
+        ``stamp`` with the estimated angular velocity.
         """
         tracks, row = self.tracks, self.row
         shape = tracks.detections[row].obstacle

@@ -1,6 +1,6 @@
 """Policies: methods that reproduce a skill around obstacles, with one file for each method.
 
-``POLICIES`` is the registry: to add a policy, write one file and add one line here.
+To add a policy, write a file with its class and add one line to the registry ``POLICIES`` below.
 """
 
 from imitarm.policies.acfra import ACFRA
@@ -43,7 +43,7 @@ POLICIES: Registry[type[Policy]] = Registry(
         "rrt-connect-tilt": "imitarm.policies.baselines.joint_planner:TiltLimitedRRTConnect",
     },
 )
-"""All policies by name."""
+"""Registry of all policies: the class of each policy by its name."""
 
 __all__ = [
     "ACFRA",

@@ -31,43 +31,42 @@ class ACFRA(PathPolicy):
     r"""Adapt the whole path once, then follow it (thesis Chapter 4).
 
     The constructor decomposes the learned path ``x_0(t)`` into Gaussian components with responsibilities ``h_k(t)``.
-    The method ``reset`` displaces the means of the components near an obstacle by ``Delta_k``. It raises an error when
-    the clearance can't be kept::
+    The method ``reset`` displaces the means of the components near an obstacle by ``Delta_k``::
 
         x(t) = x_0(t) + w(t) sum_k h_k(t) Delta_k
 
     The window ``w`` is 0 at the start, at the goal and at the pinned times. The method ``step`` follows this path as
     :class:`~imitarm.policies.path_policy.PathPolicy` describes.
 
-    Only the method ``"certified"`` raises an error in advance when it can't keep the clearance. The thesis's potential
-    fields (``"mapf"``, ``"literal"``) serve for comparison, so the robot follows their paths even if these paths do not
-    keep the clearance.
+    If the argument ``method`` is ``"certified"`` and no path keeps the clearance, ``reset`` raises an error. The
+    thesis's potential fields (``"mapf"`` and ``"literal"``) serve for comparison: the robot follows their paths even if
+    these do not keep the clearance.
 
-    Demonstrations may take several different paths, each of which has its own skill (see
-    :func:`~imitarm.demonstrations.group_by_path`). The policy then adapts each of these paths between the same start
-    and goal. It follows the feasible path with the smallest displacement, measured in standard deviations of the path's
-    own demonstrations.
+    If the demonstrations take several different paths, fit one skill to each path (see
+    :func:`~imitarm.demonstrations.group_by_path`). The policy then adapts each path to the same start and goal. It
+    follows the feasible path with the smallest displacement, measured in standard deviations of the demonstrations of
+    this path.
 
     Args:
         skill: skill to reproduce.
         alternatives: one skill for each other demonstrated path of the same task.
-        method: name in :data:`~imitarm.policies.ADAPTERS`.
+        method: name of the adaptation method in :data:`~imitarm.policies.ADAPTERS`.
         tool_radius: radius of one sphere about the tool's tip [m]; use it instead of ``tool_spheres``.
         tool_spheres: spheres that contain the tool, rows x y z r in the tool's frame, shape (m, 4) [m].
         clearance: required distance of the tool to every obstacle [m].
-        forbidden: directions in which the motion must not leave the learned path, shape (m, 3).
-        pinned: times at which the path must not move [s].
+        forbidden: directions in which the path must not be displaced from the learned path, shape (m, 3).
+        pinned: times at which the path must keep its learned position [s].
         arm: the arm with its tool. If given, the policy plans and follows a joint path of the whole arm, and does not
             use ``tool_radius`` and ``tool_spheres``. None: the policy plans only the path of the tool.
         max_tilt: largest rotation of the tool of ``arm`` away from the learned rotation [rad]; see
             :func:`~imitarm.policies.adapt`.
         goal_tilt: largest rotation of the tool of ``arm`` at the goal [rad]; see :func:`~imitarm.policies.adapt`.
-        allowance: additional clearance for the robot's tracking errors [m]; used only if a path with this larger
-            clearance is found. The default is 2 mm for a plan of the tool, and 5 mm for a plan of the whole arm.
+        allowance: additional clearance for the robot's tracking errors [m]. If no path has this additional clearance,
+            the policy plans without it. None: 2 mm for a plan of the tool, and 5 mm for a plan of the whole arm.
         following: ``gain``, ``patience`` and ``arrival`` of :class:`~imitarm.policies.path_policy.PathPolicy`.
 
     Attributes:
-        adaptation: result of the last adaptation, even if the scene was refused.
+        adaptation: result of the last adaptation, even if it is not feasible.
     """
 
     def __init__(
@@ -152,7 +151,7 @@ class ACFRA(PathPolicy):
 
     @property
     def plan(self) -> Adaptation | None:
-        """The result of the last adaptation; reports draw it."""
+        """The result of the last adaptation, for drawing it in reports."""
         return self.adaptation
 
 

@@ -55,7 +55,7 @@ ADAPTERS: Registry[PathAdapter] = Registry(
 
 
 def adapter_named(method: str) -> PathAdapter:
-    """Return a method of ``ADAPTERS``. For the default method, installed packages are not searched, to save time.
+    """Return the method of ``ADAPTERS`` with this name. The default method is returned without a search of plugins.
 
     Raises:
         UnknownNameError: when no method has that name.
@@ -89,52 +89,54 @@ def adapt(
     """Adapt the whole path of a skill to the obstacles of a scene.
 
     The method ``certified`` moves the affected components by the smallest displacement that keeps the clearance on the
-    whole path. If no displacement keeps the clearance, it refuses and gives the reason. The methods ``mapf`` and
-    ``literal`` are the thesis's potential fields (see ``potential_components``), which may fail. The path keeps its
-    position at its start, at its goal and at the ``pinned`` times. Specify the tool by exactly one of ``tool_radius``,
-    ``tool_spheres`` and ``arm``.
+    whole path. If no displacement keeps the clearance, the result is not feasible and gives the reason. The methods
+    ``mapf`` and ``literal`` are the thesis's potential fields (see ``potential_components``); they do not guarantee a
+    clearance. All methods keep the path's start, its goal, and its positions at the ``pinned`` times. Specify the tool
+    by exactly one of ``tool_radius``, ``tool_spheres`` and ``arm``.
 
     The motion begins at time 0. At that time, the obstacles are at the poses given by the scene; from then on, they
     move with their velocities.
 
     Args:
         skill: a fitted skill, or its decomposed path (``ComponentPath.of_skill``), which can be adapted to many scenes.
-            A decomposed path has its own ends, pinned times and samples, so leave out ``pinned``, ``start`` and
-            ``n_samples``. If the scene has a goal, the decomposed path must end there.
+            A decomposed path already has a start, pinned times and samples, so leave out ``start``, ``pinned`` and
+            ``n_samples``. If the scene has a goal, the decomposed path must end at this goal.
         scene: goal and obstacles; if the goal is None, the learned goal is used.
         method: a name in ``ADAPTERS``: ``"certified"``, ``"mapf"``, ``"literal"`` or a registered method.
-        tool_radius: the tool as one sphere of this radius about its tip [m]; 0 for a point.
-        tool_spheres: the tool as spheres that contain it: rows x y z r in the tool's frame, shape (m, 4) [m]. The
-            spheres rotate with the tool's learned orientation.
-        arm: the arm with its tool. A joint path of the arm is planned, on which every moving part of the arm keeps the
-            clearance. The links stay at least 12 mm apart, and the motion is slowed down where the limits of the arm
-            require it.
+        tool_radius: radius of one sphere about the tip that represents the tool [m]; 0 for a point.
+        tool_spheres: spheres that contain the tool: rows x y z r in the tool's frame, shape (m, 4) [m]. On the path,
+            the spheres have the learned orientation of the tool.
+        arm: the arm with its tool. The function then plans a joint path on which every moving part of the arm keeps the
+            clearance and the links stay at least 12 mm apart. The motion is slower than learned where the velocity or
+            acceleration limits of the arm require it.
         clearance: required distance from the tool, or from the whole arm, to every obstacle [m].
-        forbidden: directions in which no component may move, shape (m, 3): see ``HORIZONTAL_ONLY`` and ``NOT_DOWN``.
-        pinned: times [s] at which the path must not move, for example contact points. With ``arm``, the tool is not
-            tilted at these times either.
+        forbidden: directions in which no component may move, shape (m, 3), for example ``HORIZONTAL_ONLY`` or
+            ``NOT_DOWN``.
+        pinned: times [s] at which the path must keep its learned position, for example contacts. With ``arm``, the tool
+            also keeps its learned rotation at these times.
         start: pose of the tool at the start of the motion; None: the learned start.
         n_samples: number of samples along the path; None: 200.
-        state: measured state of ``arm``, from whose posture the motion starts; None: a posture near ``arm.home`` with
-            the tool at the start.
-        max_tilt: largest rotation of the tool of ``arm`` away from the learned rotation [rad]. At start and goal, this
-            rotation is always 0. The default is two standard deviations of the demonstrated rotation, and 0 if no
-            orientation was learned.
+        state: measured state of ``arm``; the motion starts in its posture. None: the motion starts in a posture near
+            ``arm.home`` with the tool at the start of the path.
+        max_tilt: largest rotation of the tool of ``arm`` away from the learned rotation between start and goal [rad].
+            None: two standard deviations of the demonstrated rotation, or 0 if no orientation was learned. At the
+            start, the tool always has the learned rotation.
         goal_tilt: largest rotation of the tool of ``arm`` away from the learned rotation at the goal [rad]. The tool is
-            rotated only if the arm does not keep the clearance at the goal with the learned rotation.
-        allowance: additional clearance for the tracking errors of the robot [m]; used only if a path with this larger
-            clearance is found.
-        margin: a ``CoverageMargin``, which bounds the error of the predicted obstacle positions. At time t, the
-            distance to an obstacle that a tracker estimates, or that moves, is then at least ``clearance +
-            margin.at(t)``. The time t counts from the time at which the obstacle was seen. None: predictions are exact.
-        margin_horizon: the margin grows until this time after the obstacle was seen [s]; None: it grows without end.
+            rotated at the goal only if the arm can't keep the clearance there with the learned rotation.
+        allowance: additional clearance for the tracking errors of the robot [m]. If no path has this additional
+            clearance, the function plans without it.
+        margin: a ``CoverageMargin``, which bounds the error of the predicted obstacle positions. It applies to
+            obstacles that move or that a tracker estimates. The path keeps the distance ``clearance + margin.at(t)``
+            from the prediction, where t [s] is the time since the obstacle was last detected. None: predictions count
+            as exact.
+        margin_horizon: time after the last detection of an obstacle at which the margin stops to grow [s]; None: never.
         hold: the whole arm must keep its clearances at the goal for this long after the arrival [s].
         max_attempts: largest number of attempts in the search for a joint path, to limit the computing time; None: no
-            limit. The search may also try to execute the path later, so that obstacles pass first; such attempts are
+            limit. The search may also try to execute the path later, after an obstacle has passed; such attempts are
             not counted.
 
     Returns:
-        The adaptation; check ``feasible`` before executing it.
+        The adaptation. Check its attribute ``feasible`` before you execute it.
 
     Raises:
         UnknownNameError: when no method has that name.
@@ -285,10 +287,10 @@ def of_whole_arm(
     began: float,
     margins: Sequence[PredictionMargin | None],
 ) -> Adaptation:
-    """Return the adaptation of the whole arm that follows from the search for a joint path.
+    """Return the result of ``adapt`` for the whole arm, from the result of the search for a joint path.
 
     Args:
-        tool: the given adaptation, whose other values the result keeps.
+        tool: the adaptation of the tool's path; the values that do not depend on the arm are copied from it.
         solution: result of the search for a joint path.
         scene: the obstacles.
         clearance: required clearance [m].
@@ -379,7 +381,7 @@ def _spheres(path: ComponentPath, radius: float | None, spheres: ArrayLike | Non
 
 
 def allowed_directions(forbidden: ArrayLike) -> AllowedDirections:
-    """Return the directions in which components may move, given the forbidden directions, shape (m, 3).
+    """Return the directions in which components may move; ``forbidden`` are the other directions, shape (m, 3).
 
     Raises:
         InputError: when a direction is zero or not finite.
@@ -412,13 +414,13 @@ def _detour(problem: AvoidanceProblem, adapter: PathAdapter) -> Detour:
 
 
 def depends_on_time(scene: Scene, margins: Sequence[PredictionMargin | None]) -> bool:
-    """Return whether a guarantee depends on the schedule, because an obstacle moves or a margin grows."""
+    """Return whether a guarantee of clearance depends on time, because an obstacle moves or a margin grows."""
     growing = any(margin is not None and margin.growth > 0.0 for margin in margins)
     return growing or any(obstacle.velocity.any() for obstacle in scene.obstacles)
 
 
 def validity(scene: Scene, duration: float, margins: Sequence[PredictionMargin | None], *, arm: bool = False) -> str:
-    """Return a text that says what a guarantee assumes and what it does not cover."""
+    """Return a text that says what the guarantee of clearance assumes, and what it does not cover."""
     moving = [scene.name_of(i) for i, obstacle in enumerate(scene.obstacles) if obstacle.velocity.any()]
     covers = "it covers the tool on the planned path, but neither the links of the arm nor tracking errors"
     if arm:
@@ -441,10 +443,9 @@ def _assumed(scene: Scene, moving: Sequence[str], margins: Sequence[PredictionMa
     if not with_margin:
         return kept
     margin = next(margin for margin in margins if margin is not None)
-    verb = "is" if len(with_margin) == 1 else "are"
-    apart = f"{' and '.join(with_margin)} {verb} where predicted, or off by less than {1e3 * margin.offset:.0f} mm"
+    apart = f"the prediction of {' and '.join(with_margin)} is wrong by at most {1e3 * margin.offset:.0f} mm"
     if margin.growth > 0.0:
-        apart += f" and {1e3 * margin.growth:.0f} mm more each second"
+        apart += f" plus {1e3 * margin.growth:.0f} mm per second"
         apart += f" until {margin.until:.2f} s" if np.isfinite(margin.until) else ""
     others = [name for name in moving if name not in with_margin]
     return apart if not others else f"{apart}, and {' and '.join(others)} keep the given velocity"

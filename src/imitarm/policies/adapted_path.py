@@ -1,4 +1,4 @@
-"""Adaptation: a path that was adapted to a scene, with its certificate, and the texts that explain a refusal."""
+"""Adaptation: a path that was adapted to a scene, with its guaranteed clearance, or the reason why there is no path."""
 
 from __future__ import annotations
 
@@ -31,41 +31,42 @@ class Adaptation:
     """The path of a skill, adapted to a scene.
 
     Attributes:
-        nominal: the path before it is adapted to the obstacles.
+        nominal: the learned path between the start and the goal, without obstacles.
         trajectory: the adapted path, at the same times; if not ``feasible``, it is the best attempt, which must not be
             executed.
         displacement: displacement of each component's mean, shape (n_components, 3) [m].
         moved: whether each component moved, shape (n_components,).
         means: centres of the components before they moved, shape (n_components, 3) [m].
         covariances: position covariances of the components, shape (n_components, 3, 3) [m^2].
-        responsibilities: responsibilities of each component for each sample, shape (n, n_components).
-        divided: whether the learned components were too wide for this scene and were divided. If so, the arrays above
-            describe more, narrower components.
+        responsibilities: responsibilities ``h_k`` of the components at the n samples of the path, shape (n,
+            n_components).
+        divided: whether the learned components were too wide for this scene and were divided into narrower components.
+            If so, the arrays above describe the narrower components.
         tolerance: covariance of the demonstrated positions along the path, shape (n, 3, 3) [m^2].
         min_clearance: smallest distance from the tool's spheres to an obstacle, at the samples [m]; inf without
             obstacles. If an obstacle has a margin for its prediction error, the margin is subtracted from its distance.
-        certified_clearance: guaranteed lower bound of the clearance on the whole polyline through the samples [m]. The
-            bound holds for the true obstacles, as long as each one is within its margin of its predicted position.
-        only_on_schedule: whether the guarantee depends on the schedule, because an obstacle moves or its margin grows.
-            The guarantee then holds only while the motion is on time, which means that the tool reaches each sample of
-            ``trajectory`` at the sample's time, counted from the scene's ``stamp``. The guarantee ends with the last
-            sample.
+        certified_clearance: guaranteed lower bound of the clearance at the samples and between them [m]. The bound
+            holds while the error of each obstacle's predicted position is at most the margin of this obstacle.
+        only_on_schedule: whether the guarantee depends on time, because an obstacle moves or its margin grows. The
+            guarantee then holds only if the tool reaches each sample of ``trajectory`` at the sample's time, counted
+            from the scene's ``stamp``. The guarantee ends at the time of the last sample.
         validity: text that says what the guarantee assumes and what it does not cover.
         deviation: largest displacement of a component's mean, in standard deviations of the demonstrations (Mahalanobis
             distance).
         jerk_ratio: largest jerk of the adapted path, divided by the largest jerk of the nominal path.
-        jerk_reason: why ``jerk_ratio`` exceeds 10; empty if it does not.
-        feasible: whether ``certified_clearance`` reaches the required clearance and the path is within the method's
-            limits on displacement and step length.
-        reason: which obstacle blocks the path and why it can't be avoided; empty when feasible.
+        jerk_reason: text that says why ``jerk_ratio`` exceeds 10; empty if it is at most 10.
+        feasible: whether ``certified_clearance`` is at least the required clearance, and the displacements and the
+            steps of the path are within the method's limits.
+        reason: text that says which obstacle blocks the path, and why it can't be avoided; empty if ``feasible``.
         method: name of the method.
         compute_time: computing time of the whole adaptation [s].
         joints: joint positions along the path, shape (n, n_joints) [rad]; None when only the tool was planned. Between
             two samples the joints move linearly.
         tilt: largest rotation of the tool away from the learned rotation [rad].
-        approach: motion of the arm from its start posture to the first posture of ``joints``, to be executed before the
-            path; None if the start posture is already the first posture.
-        arm_plan: the plan of the whole arm, from which ``replan`` continues; None when only the tool was planned.
+        approach: motion of the arm from its start posture to the first posture of ``joints``; execute it before the
+            path. None if both postures are equal.
+        arm_plan: the plan of the whole arm, which ``replan`` uses as its first guess; None when only the tool was
+            planned.
     """
 
     nominal: Trajectory
@@ -132,7 +133,7 @@ class Adaptation:
 
 
 def jerk_reason(scene: Scene, detour: Detour, ratio: float, clearance: float) -> str:
-    """Return why the jerk of a path exceeds its limit; empty if it does not."""
+    """Return a text that says why the jerk of a path exceeds its limit; empty if it does not exceed the limit."""
     if ratio <= MAX_JERK_RATIO:
         return ""
     tool = detour.clearance.tool
@@ -146,7 +147,7 @@ def jerk_reason(scene: Scene, detour: Detour, ratio: float, clearance: float) ->
 
 
 def refusal(scene: Scene, problem: AvoidanceProblem, detour: Detour, method: str, adapter: PathAdapter) -> str:
-    """Return a message that says which obstacle can't be avoided, why, and what to change."""
+    """Return a message that names the obstacle that can't be avoided, the reason, and what the user can change."""
     path, k = problem.path, problem.nominal.tool.n_spheres
     required = f"{1e3 * problem.clearance:.3g} mm required"
     if any(margin is not None for margin in problem.nominal.tool.margins):

@@ -1,4 +1,4 @@
-"""Approach: a clear motion of the joints to another start posture, before the motion of a skill begins."""
+"""Approach: a collision-free motion of the joints to the start posture of a plan, before the skill's motion begins."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _STEP, _SPEED = 0.05, 0.6  # [rad] between samples; fraction of the largest spee
 
 @dataclass(frozen=True, eq=False)
 class Approach:
-    """A motion of the joints before the motion of the skill begins; it keeps the same clearances as the plan.
+    """A motion of the joints to the start posture of a plan; it keeps the same clearances as the plan.
 
     Attributes:
         joints: joint positions, shape (m, n_joints) [rad]; between two samples the joints move linearly.
-        times: times from 0, shape (m,) [s].
+        times: times of these samples, from 0, shape (m,) [s].
     """
 
     joints: Array

@@ -1,23 +1,22 @@
 r"""Proof that a whole arm keeps its clearance on a joint path, at the samples and between them.
 
-Between two samples every joint moves linearly, and the centre c of a sphere of the arm moves on an arc. The distance of
-this arc from the straight line between its two ends is at most :math:`e`:
+Spheres cover the arm. Between two samples, every joint moves linearly, and the centre c of a sphere moves on an arc.
+While the joints move by :math:`\Delta q`, the distance of c from the straight line between its two ends is at most
 
 .. math:: e = \tfrac18 \sum_{i,j} |\Delta q_i|\,|\Delta q_j|\,R_{\max(i,j)}
 
-Here :math:`R_j` is the largest distance of the centre from the axis of joint j (1 for a prismatic joint). The bound e
-is valid because the second derivative of c with respect to the joints i and j has a norm of at most
-:math:`R_{\max(i,j)}`. The signed distance to a convex obstacle is a convex function of the point, so the tangents at
-the two ends give a lower bound of the distance on the line. The distance on the arc is therefore at least the distance
-on the line minus e. Where the resulting bound is too low, the segment is divided into halves, which makes e four times
-smaller.
+Here, :math:`R_j` is the largest distance of c from the axis of joint j (1 for a prismatic joint). The bound e holds
+because the norm of the second derivative of c with respect to the joints i and j is at most :math:`R_{\max(i,j)}`. The
+signed distance of a point from a convex obstacle is a convex function of the point. Its tangents at the two ends
+therefore give a lower bound of the distance on the line. The distance on the arc is at least this bound minus e. Where
+the result is too low, the segment is divided into halves, which makes e four times smaller.
 
-For an obstacle with a constant velocity, the proof is the same in coordinates that move with the obstacle. The proof
-also holds for the distance minus a margin that grows with time (:mod:`~imitarm.policies.prediction_margin`).
+For an obstacle with a constant velocity, the proof is the same in coordinates that move with the obstacle. A margin
+that grows with time can be subtracted from the distance (:mod:`~imitarm.policies.prediction_margin`).
 
-The proof also applies to the distance between two links of the arm. In the frame of the inner link, which is nearer to
-the base, only the joints between the two links move the outer link. The distance from a moving point to a fixed point
-is also a convex function.
+The proof also applies to the distance between two links of the arm. Let the inner link be the link nearer to the base.
+In the frame of the inner link, only the joints between the two links move the outer link. The distance of a moving
+point from a point of the inner link is a convex function of the moving point.
 """
 
 from __future__ import annotations
@@ -50,13 +49,13 @@ _TINY = 1e-9  # [m] a joint that moves a sphere has at least this distance from 
 
 @dataclass(frozen=True)
 class ArmClearance:
-    """The smallest clearance of an arm on a joint path, and the place on the path that has it.
+    """The smallest clearance of an arm on a joint path, and where on the path it occurs.
 
     Attributes:
-        room: distance minus the required clearance and minus the margin [m]. A value of at least 0 is a guaranteed
-            lower bound on the whole path. A negative value was measured at one point of the path; at other points, the
-            value may be lower.
-        obstacle: index of the obstacle; ``SELF`` for two links.
+        room: distance minus required clearance minus margin [m]. If the value is at least 0, it is a guaranteed lower
+            bound on the whole path. A negative value was measured at one point of the path; it is no bound for the rest
+            of the path.
+        obstacle: index of the nearest obstacle; ``SELF`` if two links of the arm are nearest to each other.
         sphere: index of the sphere of the arm; for two links, the sphere of the outer link.
         other: index of the sphere of the inner link; -1 for an obstacle.
         sample: index of the sample at or before the point with this clearance.
@@ -70,18 +69,19 @@ class ArmClearance:
 
 
 class ArmAmongObstacles:
-    """An arm, the obstacles and fixtures that it must not approach, and its links, which must stay apart.
+    """An arm with the obstacles and fixtures from which it keeps a distance, and with links that must stay apart.
 
     Args:
         arm: the arm with its tool.
         obstacles: convex obstacles at time 0, which move at their velocities. A rotating obstacle is replaced by a
             sphere about its centre that contains it.
         clearance: required distance from every moving part of the arm to every obstacle [m].
-        fixtures: objects on which the arm stands or works, such as a table. In one of the postures ``contacts`` or at
-            home, a part of the arm may be nearer to a fixture than ``clearance``. This part may then always come as
-            near as in that posture. All other parts keep the clearance.
-        contacts: postures in which parts of the arm may be near fixtures, shape (k, n_joints) [rad].
-        own: the links that must stay apart, and their required clearance; None: links are not checked.
+        fixtures: objects on which the arm stands or works, such as a table. A part of the arm that is nearer to a
+            fixture than ``clearance`` in the home posture, or in a posture of ``contacts``, may always come as near as
+            in this posture. All other parts keep the clearance.
+        contacts: postures in which parts of the arm are meant to be near fixtures, shape (k, n_joints) [rad].
+        own: the pairs of links that must stay apart, and their required clearance; None: these distances are not
+            checked.
         margins: the margin of each obstacle, or None for an obstacle without a margin; None: there are no margins.
 
     Attributes:
@@ -116,7 +116,7 @@ class ArmAmongObstacles:
 
     @cached_property
     def without_margins(self) -> ArmAmongObstacles:
-        """The same surroundings, but with obstacles that have no margins."""
+        """The same arm, obstacles and fixtures, without the margins of the obstacles."""
         if all(pairs.margin is None for pairs in self._pairs):
             return self
         other = copy(self)
@@ -129,13 +129,13 @@ class ArmAmongObstacles:
         return max((float(np.linalg.norm(pairs.velocity)) for pairs in self._pairs), default=0.0)
 
     def gaps(self, path: ArmPath, times: Array, reach: float, *, connected: bool = True) -> Gaps:
-        """Return, for each sample, the pairs whose distance is below the required clearance plus ``reach``.
+        """Return the pairs (sphere and obstacle, or two spheres) that have less room than ``reach`` at each sample.
 
         Args:
             path: the arm at n samples.
             times: time of each sample [s], shape (n,).
-            reach: pairs are returned if their ``room`` (distance minus required clearance) is less than this [m].
-            connected: whether the samples form a path; if False, they are unrelated postures.
+            reach: limit of the room, which is the distance minus the required clearance minus the margin [m].
+            connected: True: the samples form a path; False: they are unrelated postures.
         """
         found = []
         for pairs in self._pairs:
@@ -155,8 +155,8 @@ class ArmAmongObstacles:
             path: the arm at n samples.
             times: time of each sample [s], shape (n,).
             velocity: joint velocities, shape (n, n_joints) [rad/s].
-            obstacles: largest permitted rate at which distances to obstacles shrink.
-            links: largest permitted rate at which distances between links shrink.
+            obstacles: limit of the rate at which distances to obstacles shrink.
+            links: limit of the rate at which distances between links shrink.
         """
         found = []
         for pairs in self._pairs:
@@ -166,21 +166,21 @@ class ArmAmongObstacles:
         return Gaps.of(path, times, found)
 
     def clearance_at(self, path: ArmPath, times: Array, reach: float) -> ArmClearance:
-        """Return the smallest clearance at the samples of a path; if its room exceeds ``reach``, return ``reach``.
+        """Return the smallest clearance at the samples of a path; the room of the result is at most ``reach``.
 
         Args:
             path: the arm at n samples.
             times: time of each sample [s], shape (n,).
-            reach: if every pair has more room than this, the room of the result is ``reach`` [m].
+            reach: largest room that is searched for [m]. If every pair has more room, the result has this room.
         """
         return lowest_of(self.gaps(path, times, reach), reach)
 
     def rooms_at(self, joints: Array, clocks: Array) -> Array:
-        """Return the smallest clearance of the same postures for each of m clocks, at most 0, shape (m,) [m].
+        """Return the smallest room of given postures, but at most 0, for each of m clocks, shape (m,) [m].
 
         Args:
             joints: unrelated postures, shape (n, n_joints) [rad].
-            clocks: times of the postures, shape (m, n) [s].
+            clocks: for each clock, the times at which the arm has the n postures, shape (m, n) [s].
         """
         (m, n), lowest = clocks.shape, np.zeros(len(clocks))
         once, often = ArmPath.of(self.arm, joints), ArmPath.of(self.arm, np.tile(joints, (m, 1)))
@@ -197,9 +197,9 @@ class ArmAmongObstacles:
     def clearance_of(self, path: ArmPath, times: Array) -> ArmClearance:
         """Bound the clearance on a whole joint path, on which the joints move linearly between the samples.
 
-        Let f and g be lower bounds of the room of a pair at the two ends of a segment, and let its distance change by
-        at most T along the segment. Its room is then at least (f + g - T) / 2 everywhere on the segment. Most pairs
-        therefore need no tangents.
+        Let f and g be the room of a pair at the two ends of a segment, and let T be the largest change of the pair's
+        distance along the segment. The room is at least (f + g - T) / 2 on the whole segment. For most pairs, this
+        bound is high enough, and the method computes no tangents.
 
         Args:
             path: the arm at n samples.
@@ -240,12 +240,12 @@ def lowest_of(gaps: Gaps, reach: float) -> ArmClearance:
 
 
 class Shrinking(NamedTuple):
-    """Limit of the rate at which a distance may shrink: ``rate`` times the sum of the room and a margin.
+    """Limit of the rate at which a distance may shrink [m/s]: ``rate * (room + margin)``.
 
     Attributes:
-        rate: [1/s].
-        margin: [m].
-        most: pairs with more room than this are not limited [m].
+        rate: factor of the limit [1/s].
+        margin: length that is added to the room [m].
+        most: room above which there is no limit [m].
     """
 
     rate: float
@@ -349,8 +349,8 @@ def bows(steps: Array, radii: Array) -> Array:
 
     Args:
         steps: absolute motion of each joint, shape (k, n_joints) [rad].
-        radii: distance of the point from the axis of each joint, taken at the end of the arc where it is larger, shape
-            (k, n_joints) [m]; 0 for joints that do not move the point.
+        radii: the larger of the point's distances from the axis of each joint at the two ends of the arc, shape (k,
+            n_joints) [m]; 0 for joints that do not move the point.
     """
     steps = np.where(radii > 0.0, steps, 0.0)
     whole, farther = radii.copy(), np.zeros(len(steps))

@@ -1,10 +1,10 @@
-"""Pairs of a sphere of the arm and an obstacle, or of two spheres of the arm, and which of them are near each other.
+"""Pairs of a sphere of the arm and an obstacle, or of two spheres of the arm, and the search for the near pairs.
 
-An arm has thousands of such pairs, but at most places of a path only few of them are near each other. Two cheap bounds
-exclude most of the distant pairs. First, between two postures, no sphere of a link moves farther than
-``ArmPath.travel`` says. The distances are therefore first measured at few postures of the path. At the postures in
-between, only the pairs that could be near are measured. Second, each obstacle is inside a bounding sphere, whose
-distance takes less time to compute.
+Spheres cover the arm. An arm has thousands of pairs, but at most points of a path only few pairs are near. Two bounds
+that take little time exclude most of the distant pairs. First, ``ArmPath.travel`` bounds how far the spheres of a link
+move between two postures. The distances are therefore measured at few postures of the path; at the postures in between,
+only the pairs that could be near are measured. Second, each obstacle is inside a bounding sphere. The distance to this
+sphere takes less time to compute than the distance to the obstacle.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ _ROUNDING = 1e-4  # [m] of the distances between links, which are first measured
 
 
 class Pairs(ABC):
-    """Pairs whose distance is checked: spheres of the arm with one obstacle, or with spheres of other links.
+    """Pairs whose distance is checked: each sphere of the arm with one obstacle, or spheres of different links.
 
     Attributes:
         arm: the arm.
         obstacle: index of the obstacle, or ``SELF``.
-        sphere: index of the sphere of each pair; if the pair is two spheres, index of the sphere farther from the base,
-            shape (n_pairs,).
-        other: index of the sphere nearer to the base; -1 if the pair contains an obstacle, shape (n_pairs,).
-        first: number of joints, counted from the base, that do not change the distance of each pair, shape (n_pairs,).
+        sphere: index of the sphere of each pair, shape (n_pairs,); in a pair of two spheres, the sphere of the link
+            farther from the base.
+        other: index of the second sphere of each pair, shape (n_pairs,); -1 for a pair with an obstacle.
+        first: index of the first joint that can change the distance of each pair, shape (n_pairs,).
         moves: whether each joint changes the distance of each pair, shape (n_pairs, n_joints).
-        group: index of the group of each pair: pairs of the same links, shape (n_pairs,).
+        group: index of the group of each pair, shape (n_pairs,); the pairs of one group have the same links.
         velocity: velocity of the obstacle, shape (3,) [m/s].
-        margin: margin of the obstacle, which is subtracted from the room; None: no margin.
+        margin: margin of the obstacle, which is subtracted from the distance; None: no margin.
     """
 
     velocity: Array = np.zeros(3)
@@ -64,7 +64,7 @@ class Pairs(ABC):
 
     @property
     def n_groups(self) -> int:
-        """Number of groups."""
+        """Number of groups of pairs with the same links."""
         return len(self._of_groups[0])
 
     @abstractmethod
@@ -98,7 +98,7 @@ class Pairs(ABC):
         return normals
 
     def without_margin(self) -> Pairs:
-        """Return the same pairs, with an obstacle that has no margin."""
+        """Return the same pairs without the margin of the obstacle."""
         if self.margin is None:
             return self
         other = copy(self)
@@ -115,7 +115,7 @@ class Pairs(ABC):
         return way
 
     def closing_speeds(self, path: ArmPath, velocity: Array) -> Array:
-        """Return bounds of the speed at which the pairs of each group approach each other, shape (n, n_groups) [m/s].
+        """Return upper bounds of the rate at which the distances of each group shrink, shape (n, n_groups) [m/s].
 
         Args:
             path: the arm at n samples.
@@ -125,16 +125,17 @@ class Pairs(ABC):
         return np.asarray(speeds + float(np.linalg.norm(self.velocity)))
 
     def near(self, path: ArmPath, times: Array, reach: Array, travel: Array | None) -> tuple[Index, Index, Array]:
-        """Return all pairs whose room is less than ``reach``.
+        """Return all pairs with less room (distance minus required clearance minus margin) than ``reach``.
 
         Args:
             path: the arm at n samples.
             times: time of each sample [s], shape (n,).
-            reach: limit of the room for each sample and each group, shape (n, n_groups) [m].
+            reach: limit of the room at each sample for each group, shape (n, n_groups) [m].
             travel: the result of :meth:`travel`; None if the samples do not form a path.
 
         Returns:
-            For each pair, the index of the sample, the index of the pair, and its room [m].
+            Three arrays with one entry for each near pair at a sample: the index of the sample, the index of the pair,
+                and the pair's room [m].
         """
         n, block = len(path), 1
         if travel is not None and n > 1:
@@ -158,7 +159,7 @@ class Pairs(ABC):
             middles, wide = _blocks(block, reach, travel)
 
     def looked_at(self, path: ArmPath, sample: Index, pair: Index, times: Array) -> tuple[Array, Array, Array]:
-        """Measure chosen pairs.
+        """Return the position, the room and the gradient of chosen pairs.
 
         Args:
             path: the arm at n samples.
@@ -167,9 +168,10 @@ class Pairs(ABC):
             times: time of each of the k samples [s].
 
         Returns:
-            Three arrays. The first has the centres of the pairs' spheres, shape (k, 3) [m]: relative to the obstacle,
-            or relative to the inner sphere in the frame of its link. The second has the room of each pair, shape (k,)
-            [m]. The third has the gradients of the room with respect to the centre, shape (k, 3).
+            Three arrays. The first contains the centres of the pairs' spheres, shape (k, 3) [m], relative to the
+            obstacle, or relative to the other sphere in the frame of the other sphere's link. The second contains the
+            room of each pair, shape (k,) [m]. The third contains the gradients of the room with respect to the centre,
+            shape (k, 3).
         """
         points = self._points(path, sample, pair, times)
         return points, *self._measured(points, pair, times)
@@ -314,21 +316,20 @@ class PairsOfLinks(Pairs):
 
 @dataclass(frozen=True, eq=False)
 class Gaps:
-    """Pairs of a sphere of the arm and an obstacle, or of two spheres of the arm, that are near each other.
+    """The near pairs at the samples of a path, each a sphere of the arm and an obstacle, or two spheres of the arm.
 
     Attributes:
         path: the arm at the samples.
         times: time of each sample [s].
-        sources: the pairs of each obstacle, and of the links.
-        source: index of each pair's source in ``sources``, shape (k,).
-        pair: index of the pair in its source, shape (k,).
-        sample: index of the sample of the path, shape (k,).
-        room: distance minus required clearance, shape (k,) [m].
+        sources: all pairs: one object for each obstacle and one for the links of the arm.
+        source: index in ``sources`` of the object with each near pair, shape (k,).
+        pair: index of each near pair in this object, shape (k,).
+        sample: index of the sample at which the pair is near, shape (k,).
+        room: distance minus required clearance minus margin, shape (k,) [m].
         obstacle: index of the obstacle; ``SELF`` for two spheres of the arm, shape (k,).
-        sphere: index of the sphere; if the pair is two spheres, index of the sphere farther from the base, shape (k,).
-        other: index of the sphere nearer to the base; -1 if the pair contains an obstacle, shape (k,).
-        first: number of joints that move both spheres and therefore do not change their distance, shape (k,); 0 for an
-            obstacle.
+        sphere: index of the sphere, shape (k,); in a pair of two spheres, the sphere of the link farther from the base.
+        other: index of the second sphere, shape (k,); -1 for a pair with an obstacle.
+        first: index of the first joint that can change the distance of the pair, shape (k,); 0 for an obstacle.
     """
 
     path: ArmPath
@@ -345,7 +346,7 @@ class Gaps:
 
     @classmethod
     def of(cls, path: ArmPath, times: Array, found: Sequence[tuple[Pairs, tuple[Index, Index, Array]]]) -> Gaps:
-        """Join the results of :meth:`Pairs.near` of several sources."""
+        """Return the near pairs of several sources together; ``found`` contains the results of :meth:`Pairs.near`."""
         columns: list[tuple[Array | Index, ...]] = [(*[np.zeros(0, dtype=np.intp)] * 3, np.zeros(0))]
         columns[0] += (np.zeros(0, dtype=np.intp),) * 4
         for i, (pairs, (sample, pair, room)) in enumerate(found):
@@ -359,7 +360,7 @@ class Gaps:
         return len(self.room)
 
     def normals(self, chosen: Index) -> Array:
-        """Return unit vectors in the base frame along which the distances of pairs grow fastest, shape (m, 3)."""
+        """Return the directions in which the distances of chosen pairs grow fastest, base frame, shape (m, 3)."""
         normals = np.empty((len(chosen), 3))
         for i, pairs in enumerate(self.sources):
             of = np.flatnonzero(self.source[chosen] == i)
@@ -372,8 +373,8 @@ class Gaps:
         """Return how fast the distances of chosen pairs change.
 
         Returns:
-            The derivative with respect to each joint, shape (m, n_joints) [m/rad], and the change with time that the
-            motion of the obstacles causes, shape (m,) [m/s].
+            The derivatives of the distances with respect to the joints, shape (m, n_joints) [m/rad], and the rates of
+            change that result from the motion of the obstacles, shape (m,) [m/s].
         """
         normals = self.normals(chosen)
         rates = self.path.sphere_speeds(self.sample[chosen], self.sphere[chosen], normals)

@@ -1,18 +1,19 @@
-r"""Joint paths on which the whole arm keeps its clearance, found by improving a displacement of the learned path.
+r"""Joint paths on which the whole arm keeps its clearance, found by repeated quadratic programs.
 
-Three sets of coefficients describe the motion. The displacements :math:`\Delta` move the components of the learned
+Three vectors of coefficients describe the motion. The displacements :math:`\Delta` move the components of the learned
 path. The *tilt* :math:`\tau` rotates the tool away from the learned rotation. The self-motion :math:`\psi` moves the
-arm but not its tool. Each set is multiplied by smooth functions of time, :math:`B`. Near a joint path q(t), small
-changes of the coefficients change the joint positions by :math:`\delta q`:
+arm but not its tool. The matrices :math:`B(t)` contain smooth functions of time, which the coefficients multiply. Near
+a joint path q(t), small changes of the coefficients change the joint positions by :math:`\delta q`:
 
 .. math:: \delta q(t) = J^+(t) \begin{bmatrix} B_\Delta(t)\,\delta\Delta \\ B_\tau(t)\,\delta\tau \end{bmatrix}
           + N(t)\,B_\psi(t)\,\delta\psi
 
 Here :math:`J^+` is the right inverse of the tool's Jacobian, and N is a basis of its null space. To first order, every
 distance between a part of the arm and an obstacle is a linear function of these changes. In each round, a quadratic
-program finds the smallest displacement and tilt for which all linearised distances reach the required clearance and the
-joints stay within their limits. Inverse kinematics then brings the tool exactly to its poses. The next round begins
-with this joint path; the rounds end when all distances reach the required clearance.
+program finds the smallest displacement and tilt for which all linearised distances are at least the required clearance.
+The joints stay within their limits. Inverse kinematics then corrects the joint path, so that the tool has exactly the
+displaced and tilted poses. The next round begins with this joint path. The rounds end when all distances are at least
+the required clearance.
 """
 
 from __future__ import annotations
@@ -65,16 +66,16 @@ _AXES = np.abs(_FACETS).max(axis=1) == 1.0  # which of them are along an axis
 
 @dataclass
 class Effort:
-    """How many rounds of a search are left, so that a plan does not take too long.
+    """The number of rounds that a search may still use, so that a plan does not take too long.
 
-    A round improves a joint path once. The limit is a number of rounds, and no time, so that the result does not depend
-    on the computer.
+    In each round, the planner improves a joint path once. The limit is a number of rounds instead of a time, so that
+    the result does not depend on the speed of the computer.
     """
 
     left: float
 
     def spend(self, rounds: float = 1.0) -> bool:
-        """Use up some rounds; return whether they were left."""
+        """Subtract ``rounds`` from the number of rounds left; return whether there were enough."""
         self.left -= rounds
         return self.left >= 0.0
 
@@ -86,15 +87,15 @@ class ArmPlan:
     Attributes:
         components: the learned path and its components, before they were displaced.
         displacement: displacement of each component's mean, shape (n_components, 3) [m].
-        tilts: rotations that the plan can choose from, each relative to the learned rotation of the tool.
+        tilts: smooth functions of time for the tool's rotation away from the learned rotation.
         tilt: the chosen coefficients of ``tilts``, shape (n_tilts, 3) [rad].
-        path: the arm at the samples.
-        clearance: the smallest clearance and its place on the path. If its room is at least 0 and ``complete`` is True,
-            the clearance is certified for the whole path.
-        complete: whether ``path`` has all samples of the component path, not only the coarse ones.
+        path: postures of the arm at the samples.
+        clearance: the smallest clearance and where on the path it occurs. If its room is at least 0 and ``complete`` is
+            True, the clearance is guaranteed on the whole path.
+        complete: whether ``path`` has all samples of ``components``; False: it has only every fourth sample.
         cost: sum of the squares of displacement and tilt, both in standard deviations of the demonstrations.
         largest_tilt: largest rotation of the tool away from the learned rotation [rad].
-        speed: largest joint speed, as a fraction of the joint's limit, if the path is executed at the learned times.
+        speed: largest joint speed at the learned times, divided by the joint's velocity limit.
     """
 
     components: ComponentPath
@@ -123,18 +124,20 @@ class ArmPlanner:
         quaternions: learned rotations of the tool at the samples, tool_to_base, shape (n, 4).
         max_tilt: largest rotation away from the learned rotation at each sample, shape (n,) [rad].
         allowed: directions in which components may move.
-        smoothness: weight of the squared jerk of the displacement (see ``style_scale``).
-        free_start: whether the self-motion of the plan may change the posture at the start.
-        tilts: possible rotations of the tool away from the learned rotation; at the goal, ``max_tilt`` limits them too.
-        begun: whether the motion has begun; if so, the self-motion must not change the velocity at the start.
-        spare: additional clearance that the planner aims at but does not require [m].
-        quick: whether to give up after fewer rounds.
-        effort: rounds that are left in the whole search; None: no limit.
+        smoothness: weight of the squared jerk in the cost of a displacement (see ``style_scale``).
+        free_start: whether the plan may start in another posture with the same tool pose.
+        tilts: smooth functions of time for the tool's rotation away from the learned rotation.
+        begun: whether the arm is already moving; if so, the self-motion of the plan does not change the joint
+            velocities at the start.
+        spare: additional clearance that the planner tries to reach; a plan without it is also feasible [m].
+        quick: whether the planner gives up after fewer rounds than usual.
+        effort: number of rounds that the whole search may still use; None: no limit.
 
     Attributes:
-        coarse: indices of the few samples that are planned first, shape (k,); all samples are planned afterwards.
-        clock: time at which the arm reaches each sample, used for moving obstacles, shape (n,) [s]; initially the times
-            of the learned motion.
+        coarse: indices of every fourth sample, shape (k,). The first rounds use only these samples; the last rounds use
+            all.
+        clock: time at which the arm reaches each sample, shape (n,) [s]. It determines the positions of moving
+            obstacles. At first, these are the learned times.
     """
 
     def __init__(
@@ -177,21 +180,21 @@ class ArmPlanner:
         return positions, self.tilts.turned(self.quaternions, tilt, samples)
 
     def tilt_at_goal(self, rotation: Array) -> Array:
-        """Return the coefficients (n_tilts, 3) [rad] of a tilt that ends with a rotation vector (3,) [rad].
+        """Return coefficients (n_tilts, 3) [rad] with which the tool is rotated by ``rotation`` (3,) [rad] at the goal.
 
-        The rotation vector must be zero unless the goal may be tilted.
+        If no rotation is allowed at the goal, ``rotation`` must be zero.
         """
         tilt = np.zeros((self.tilts.n_tilts, 3))
         tilt[-1] = rotation
         return tilt
 
     def plan(self, displacement: Array, joints: Array, tilt: Array | None = None) -> ArmPlan | None:
-        """Improve a displacement and a joint path until the whole arm keeps its clearance.
+        """Improve a first guess of the joint path until the whole arm keeps its clearance.
 
         Args:
-            displacement: initial displacement of each component's mean, shape (n_components, 3) [m].
-            joints: initial joint positions at the samples ``coarse``, shape (k, n_joints) [rad].
-            tilt: initial coefficients of the tilt, shape (n_tilts, 3) [rad]; None: no tilt.
+            displacement: first guess of the displacement of each component's mean, shape (n_components, 3) [m].
+            joints: first guess of the joint positions at the samples ``coarse``, shape (k, n_joints) [rad].
+            tilt: first guess of the coefficients of the tilt, shape (n_tilts, 3) [rad]; None: no tilt.
 
         Returns:
             A feasible plan, or the best attempt; None when the arm can't follow the tool's path.
@@ -359,7 +362,7 @@ JOINT_LIMIT = SELF - 1
 TILT_LIMIT = SELF - 2
 """Value used instead of an obstacle's index for the limit of the tool's tilt."""
 TILT_LEVER = 0.05
-"""[m/rad] Factor that converts the amount by which a tilt exceeds its limit to a missing clearance."""
+"""[m/rad] Missing clearance that counts as much as a tilt that is 1 rad above its limit."""
 
 
 @dataclass(frozen=True, eq=False)
