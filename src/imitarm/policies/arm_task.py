@@ -1,4 +1,4 @@
-"""ArmTask and ArmSolution: the input and the result of the search for a joint path."""
+"""ArmTask and ArmSolution: the input and the result of the search for a joint path of the whole arm."""
 
 from __future__ import annotations
 
@@ -22,13 +22,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ArmSolution:
-    """The result of the search for a joint path.
+    """The result of the search for a joint path of the whole arm.
 
     Attributes:
-        plan: the plan, or the best attempt; None when the arm can't follow the path at all.
-        timing: execution times of the plan; None if no plan is feasible.
+        plan: the plan, or the best attempt if no plan keeps the clearance; None if the arm can't follow the path at
+            all.
+        timing: times at which the arm reaches the samples of the plan; None if no plan is feasible.
         reason: text that says why no plan was found; empty if a plan was found.
-        approach: motion from the task's start posture to the plan's first posture; None if the two are the same.
+        approach: motion from the task's start posture to the plan's first posture; None if these two postures are
+            equal.
     """
 
     plan: ArmPlan | None
@@ -38,7 +40,7 @@ class ArmSolution:
 
     @property
     def duration(self) -> float:
-        """Duration of the approach plus the plan [s]; inf if no plan is feasible."""
+        """Duration of approach and plan together [s]; inf if no plan is feasible."""
         own = np.inf if self.timing is None else float(self.timing.times[-1])
         return own if self.approach is None else own + float(self.approach.times[-1])
 
@@ -53,14 +55,15 @@ class ArmTask:
         scene: obstacles at time 0, and fixtures.
         clearance: required distance from every moving part of the arm to every obstacle [m].
         allowed: directions in which the components of the path may be displaced.
-        max_tilt: largest rotation of the tool away from the learned rotation at each sample, shape (n,) [rad].
-        allowance: ``clearance`` minus the clearance that the safety filter keeps [m].
-        rest: the remainder of a motion that has begun; None: the motion has not begun, and the arm stands still.
+        max_tilt: largest rotation of the tool away from the learned rotation at each of n samples, shape (n,) [rad].
+        allowance: difference between ``clearance`` and the smaller clearance that the safety filter keeps [m].
+        rest: the part of the learned motion that is still ahead, if the motion has begun; None: the arm stands still at
+            the start.
         margins: the margin of each obstacle, or None for an obstacle without a margin; None: there are no margins.
         hold: the arm must keep its clearances at the goal for this long after the arrival [s].
-        max_attempts: largest number of attempts of the search; None: no limit. Attempts that only execute the path
-            later are not counted.
-        effort: how long the search may take.
+        max_attempts: largest number of attempts of the search; None: no limit. An attempt that only delays the motion
+            along an already found path is not counted.
+        effort: number of planner rounds that the search may use.
     """
 
     arm: ArmModel

@@ -1,1 +1,1 @@
-"""Avoidance methods for comparison."""
+"""Published obstacle avoidance methods, for comparison with ACFRA and RCAMO."""

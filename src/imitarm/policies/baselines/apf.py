@@ -1,4 +1,4 @@
-"""APF: follow the forces of the classical artificial potential field from the start to the goal."""
+"""APF: move along the forces of a classical artificial potential field from the start to the goal."""
 
 from __future__ import annotations
 
@@ -36,22 +36,22 @@ class APF(BaselinePolicy):
     r"""Classical artificial potential field (Khatib 1986; thesis 2.2.5, Eqs 2.15-2.22).
 
     The tool moves with the velocity ``F_a + F_r`` of :mod:`~imitarm.policies.baselines.potential_field`, from the start
-    to the goal. The method uses only three properties of the learned path: its ends, its mean speed (which scales the
-    attraction) and its largest speed (which limits the velocity). The distance ``d`` is the distance from the tool's
-    sphere to the obstacle, minus the required clearance. A step that would increase the potential is halved, so that
-    the tool does not oscillate between two obstacles. Among obstacles at rest, the potential therefore never increases.
+    to the goal. The method uses only the ends and the speed of the learned path. The mean speed scales the attraction,
+    and the largest speed limits the velocity. The distance ``d`` is the distance from the tool's sphere to the
+    obstacle, minus the required clearance. If a step would increase the potential, the step is halved until it does
+    not. The tool therefore does not oscillate between two obstacles.
 
-    **Known failure.** The sum of the forces is also zero at local minima of the potential. Such a minimum exists, for
-    example, in front of an obstacle between the tool and the goal, or beside a goal that is near an obstacle. At such a
-    minimum, the tool stops, and the method refuses the scene.
+    **Known failure.** The sum of the forces is also zero at local minima of the potential, for example in front of an
+    obstacle between tool and goal. The tool would stop at such a minimum, so the method refuses the scene.
 
     Args:
-        skill: skill that gives start, goal and speed.
-        repulsion: k [m^4/s].
-        influence: d_0 [m].
-        cap: rho_c [m].
+        skill: skill whose start, goal and speed are used.
+        repulsion: factor k of the repulsion [m^4/s].
+        influence: d_0, the distance beyond which an obstacle does not repel [m].
+        cap: rho_c, the distance from the goal beyond which the attraction is constant [m].
         speed: speed of the tool far from the goal and from obstacles, divided by the mean speed of the learned motion.
-            The gain ``eta`` of the attraction is this speed of the tool [m/s], divided by ``cap``.
+            This argument determines the gain ``eta`` of the attraction [1/s]: ``eta`` times ``cap`` is the tool's speed
+            [m/s].
         options: arguments of :class:`~imitarm.policies.path_policy.PathPolicy`.
     """
 
@@ -78,12 +78,12 @@ class APF(BaselinePolicy):
         self.speed = finite_number(speed, "APF: speed", above=0.0)
 
     def field(self, nominal: Trajectory, gaps: ToolGaps, *, moving: bool) -> _Field:
-        """Return the potential of a scene; ``moving`` says whether obstacles move."""
+        """Return the potential field of a scene; ``moving`` says whether obstacles move."""
         stiffness = self.speed * max(nominal.path_length / nominal.duration, 1e-6) / self.cap
         return _Field(self, gaps, nominal.positions[-1], stiffness, moving=moving)
 
     def reaction(self, nominal: Trajectory, position: Array, velocity: Array, fraction: float) -> Reaction:
-        """Return the motion along the forces, one control period at a time."""
+        """Return a motion along the forces that advances by one control period at a time."""
         return _FieldReaction(self, nominal, position, velocity, fraction)
 
     def tool_path(self, nominal: Trajectory, gaps: ToolGaps, scene: Scene) -> tuple[Array, Array]:

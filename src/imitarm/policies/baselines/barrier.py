@@ -1,4 +1,4 @@
-"""A control barrier function as the only avoidance: the velocity filter of Ames et al. (2019)."""
+"""Barrier: follow the learned path, with a velocity filter that is a control barrier function (Ames et al. 2019)."""
 
 from __future__ import annotations
 
@@ -21,15 +21,16 @@ _SOFT = 1e6  # weight of the squared violation, if no velocity meets all inequal
 
 
 def nearest_velocity(desired: Array, rows: Array, lower: Array) -> Array:
-    """Return the velocity nearest to ``desired`` with ``rows @ v >= lower``.
+    """Return the velocity ``v`` nearest to ``desired`` among those with ``rows @ v >= lower``.
 
-    If a single violated row determines the result, the closed form ``v = u + a (b - a . u) / |a|^2`` is used. Otherwise
-    a quadratic program is solved. If no velocity meets all rows, the result has the smallest sum of squared violations.
+    If one row alone determines the result, the function uses the closed form ``v = u + a (b - a . u) / |a|^2``.
+    Otherwise, it solves a quadratic program. If no velocity meets all inequalities, the result is nearly the velocity
+    with the smallest sum of squared violations.
 
     Args:
-        desired: u, shape (d,) [m/s].
-        rows: a, shape (n, d).
-        lower: b, shape (n,) [m/s].
+        desired: desired velocity u, shape (d,) [m/s].
+        rows: vectors a of the n inequalities ``a . v >= b``, shape (n, d).
+        lower: lower bounds b, shape (n,) [m/s].
     """
     missing = lower - rows @ desired
     if not len(missing) or missing.max() <= 0.0:
@@ -54,22 +55,22 @@ def nearest_velocity(desired: Array, rows: Array, lower: Array) -> Array:
 
 
 class Barrier(VelocityField):
-    r"""Follow the learned path by the nearest velocity that keeps the clearance.
+    r"""Follow the learned path with the velocity nearest to the desired one that keeps the clearance.
 
-    Let ``u`` be the desired velocity and ``h_o`` the distance to obstacle ``o`` minus the required clearance. Let
-    ``n_o`` be the outward normal and ``v_o`` the velocity of the obstacle's closest point. The velocity ``v`` of the
-    tool solves::
+    Let ``u`` be the desired velocity, and ``h_o`` the gap: the distance to obstacle ``o`` minus the required clearance.
+    Let ``n_o`` be the outward normal and ``v_o`` the velocity of the obstacle's closest point. The velocity ``v`` of
+    the tool solves::
 
         min |v - u|^2   s.t.   n_o . (v - v_o) >= -gamma h_o   for every obstacle o
 
     If ``h_o >= 0`` at the start, then ``h_o >= 0`` at all times, because ``dh_o/dt = n_o . (v - v_o) >= -gamma h_o``.
-    For convex obstacles, ``h_o`` also stays positive with time steps of up to ``1 / gamma``, because the gap is a
-    convex function of the position. The filter looks only one step ahead: where the desired velocity points straight at
-    an obstacle, the tool stops in front of it.
+    With time steps of up to ``1 / gamma``, ``h_o`` also stays positive, because the gap to a convex obstacle is a
+    convex function of the position. The filter looks only one step ahead: if the desired velocity points straight at an
+    obstacle, the tool stops in front of this obstacle.
 
     Args:
         skill: skill to reproduce.
-        gamma: largest rate at which the gap may shrink, divided by the gap [1/s].
+        gamma: factor [1/s]; the gap ``h_o`` [m] may shrink by at most ``gamma h_o`` [m/s].
         options: arguments of :class:`~imitarm.policies.baselines.velocity_field.VelocityField`.
     """
 
@@ -80,7 +81,7 @@ class Barrier(VelocityField):
         self.gamma = finite_number(gamma, "Barrier: gamma", "1/s", above=0.0)
 
     def velocity(self, desired: Array, around: NearObstacles, limits: Array) -> Array:
-        """Return the velocity nearest to ``desired`` that keeps all gaps and respects the forbidden directions."""
+        """Return the velocity nearest to ``desired`` that meets all inequalities and has no forbidden direction."""
         rows = np.concatenate([around.normal, -self.one_sided])
         approach = np.sum(around.normal * around.velocity, axis=1) - around.drift - self.gamma * around.gap
         return nearest_velocity(desired, rows, np.concatenate([approach, -limits]))

@@ -1,4 +1,4 @@
-"""Common parts of the baselines that plan the path of the tool: gaps to obstacles, and the learned path."""
+"""Base class of the baselines that plan the path of the tool, and the distances from tool to obstacles."""
 
 from __future__ import annotations
 
@@ -31,18 +31,20 @@ _BESIDE = 2e-3  # [m] from the learned path: less is not called avoiding
 
 
 class ToolGaps:
-    """Distances from all obstacles of a scene to the tool, which one sphere about its tip represents.
+    """Distances between all obstacles of a scene and the tool, which is represented by one sphere about its tip.
 
-    The gap to obstacle ``o`` at the tip position ``x`` is ``g_o(x) = sd_o(x) - r``, with the signed distance ``sd_o``
-    and the radius ``r`` of the sphere that contains the tool. The gap is negative in contact. Its gradient is the
-    obstacle's outward normal ``n``, so the closest point of the obstacle is ``x - sd_o(x) n``.
+    If the tip is at the position ``x``, the gap to obstacle ``o`` is ``g_o(x) = sd_o(x) - r``. Here, ``sd_o`` is the
+    signed distance from the obstacle, and ``r`` is the radius of the sphere. The gap is negative if the sphere and the
+    obstacle overlap. The gradient of the gap is the obstacle's outward normal ``n``, so the closest point of the
+    obstacle is ``x - sd_o(x) n``.
 
     Args:
         scene: the obstacles at time 0.
-        tool_spheres: spheres that contain the tool, rows x y z r in the tool's frame, shape (m, 4) [m]; None: the tip.
+        tool_spheres: spheres that contain the tool, rows x y z r in the tool's frame, shape (m, 4) [m]; None: the tool
+            is a point.
 
     Attributes:
-        radius: r [m].
+        radius: radius r of the sphere [m].
         n_obstacles: number of obstacles.
     """
 
@@ -65,7 +67,7 @@ class ToolGaps:
         return distances(self._packed, points, times) - self.radius
 
     def gaps_and_normals(self, points: ArrayLike, times: ArrayLike | None = None) -> tuple[Array, Array]:
-        """Return :meth:`gaps` and the outward normals of the obstacles, shape (n_obstacles, ..., 3)."""
+        """Return the result of :meth:`gaps`, and the outward normals of the obstacles, shape (n_obstacles, ..., 3)."""
         distance, normal = distances_and_gradients(self._packed, points, times)
         return distance - self.radius, normal
 
@@ -73,19 +75,20 @@ class ToolGaps:
 class BaselinePolicy(PathPolicy):
     """Base class of the baselines that plan the path of the tool; all of them use the same learned path and gaps.
 
-    A subclass implements :meth:`tool_path`. At each phase, the tool has the learned orientation.
+    A subclass implements :meth:`tool_path`. At each fraction of the duration, the tool has the learned orientation.
 
-    If the subclass also implements :meth:`reaction`, the method reacts to obstacles that move, appear or disappear.
-    As soon as the scene changes, the method integrates its equations one control period at a time, with the observed
-    obstacles. It then refuses no scene. While the scene stands still, the method plans its path only once.
+    While the scene does not change, the policy plans its path only once. If the subclass also implements
+    :meth:`reaction`, the policy reacts to obstacles that move, appear or disappear. As soon as the scene changes, the
+    policy integrates its equations one control period at a time, with the observed obstacles. From then on, it does not
+    refuse a scene.
 
     Args:
         skill: skill to reproduce.
         options: arguments of :class:`~imitarm.policies.path_policy.PathPolicy`.
 
     Attributes:
-        predicts: whether the planned path avoids moving obstacles at the places where they will be at the planned
-            times. The policy follows such a plan on schedule.
+        predicts: whether the planned path avoids moving obstacles at their predicted positions. The policy then follows
+            the path at the planned times.
     """
 
     predicts: ClassVar[bool] = False
@@ -98,13 +101,13 @@ class BaselinePolicy(PathPolicy):
         self._reaction: Reaction | None = None
 
     def reaction(self, nominal: Trajectory, position: Array, velocity: Array, fraction: float) -> Reaction | None:
-        """Return the motion for a scene that changes; None if the method can only plan a whole path.
+        """Return a motion that reacts to a changing scene; None if the method can only plan a whole path.
 
         Args:
-            nominal: the learned path between the start and the goal of this motion, 200 samples.
+            nominal: learned path between the start and the goal of this motion, with 200 samples.
             position: measured position of the tool, shape (3,) [m].
             velocity: velocity of the tool, shape (3,) [m/s].
-            fraction: fraction of the duration that has passed.
+            fraction: elapsed time divided by the duration.
         """
         del nominal, position, velocity, fraction
         return None
@@ -114,7 +117,7 @@ class BaselinePolicy(PathPolicy):
         """Return the planned path of the tool's tip.
 
         Args:
-            nominal: the learned path between the start and the goal of this motion, 200 samples from time 0.
+            nominal: learned path between the start and the goal of this motion, with 200 samples from time 0.
             gaps: distances to the obstacles.
             scene: the scene.
 
@@ -141,7 +144,7 @@ class BaselinePolicy(PathPolicy):
         return replace(plan, only_on_schedule=self.predicts and not scene.packed.still)
 
     def reset(self, observation: Observation) -> None:
-        """Plan the path if the scene stands still; otherwise, begin to react step by step.
+        """Plan the path if no obstacle moves; otherwise, begin to react one control period at a time.
 
         Raises:
             InfeasibleError: when the method plans a path and finds no solution; the message gives the reason.
@@ -205,7 +208,7 @@ class BaselinePolicy(PathPolicy):
         return Command(np.concatenate([velocity, turning]), progress=end, status=status[0], reason=status[1])
 
     def allowed(self, vectors: Array) -> Array:
-        """Return forces or velocities, shape (..., 3), without their parts in forbidden directions."""
+        """Return forces or velocities, shape (..., 3), without their components in forbidden directions."""
         for direction in self._forbidden:
             vectors = vectors - np.maximum(vectors @ direction, 0.0)[..., None] * direction
         return vectors

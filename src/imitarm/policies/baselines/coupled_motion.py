@@ -1,4 +1,4 @@
-"""The motion of a primitive to which an avoidance method adds a coupling term."""
+"""Base class of the baselines that add a coupling term to a dynamic movement primitive."""
 
 from __future__ import annotations
 
@@ -29,20 +29,21 @@ _NEAR, _STILL = 5e-3, 5e-4  # [m] from the goal, and within a quarter of the dur
 
 
 class MotionState(NamedTuple):
-    """State of the motion, and distances and directions from the tool to the obstacles.
+    """State of a primitive's motion, with the distances and directions between the tool and the obstacles.
 
-    Velocities are multiplied by the duration T, as in the equation of a motion primitive (``tau x' = v`` with tau = T).
+    Velocities are multiplied by the duration T, as in the equation of a motion primitive, and thus have the unit m.
 
     Attributes:
         position: x, shape (3,) [m].
         velocity: v = T x', shape (3,) [m].
-        phase: s, which decays from 1 at the start to 0.01 after the duration T.
+        phase: phase s of the primitive, which decays from 1 at the start to 0.01 after the duration T.
         fraction: time divided by the duration.
         learned: position of the nominal path at this time, shape (3,) [m].
-        distance: distance from the tool to each obstacle, minus the required clearance; at least 5 mm, shape (n,) [m].
-        reach: distance from the tool's tip to the closest point of each obstacle; at least 5 mm, shape (n,) [m].
-        normal: outward normals at the closest points, shape (n, 3); the closest point is ``x - reach normal``.
-        relative: v minus T times the velocity of each obstacle's closest point, shape (n, 3) [m].
+        distance: the gap, or 5 mm if the gap is smaller, shape (n,) [m].
+        reach: distance from the tool's tip to the closest point of each obstacle, or 5 mm if it is nearer, shape (n,)
+            [m].
+        normal: outward normals at the closest points ``x - reach normal``, shape (n, 3).
+        relative: velocity of the tool relative to each obstacle's closest point, times T, shape (n, 3) [m].
         gap: distance from the tool to each obstacle, minus the required clearance; may be negative, shape (n,) [m].
     """
 
@@ -64,24 +65,24 @@ class MotionState(NamedTuple):
 
 
 class CoupledMotion(BaselinePolicy):
-    r"""Base class of the baselines that add a coupling term ``Phi`` to the equation of a primitive.
+    r"""Base class of the baselines that add a coupling term ``Phi`` to a dynamic movement primitive.
 
     The equation is::
 
         T^2 x'' = K (y(s) - x) - D T x' + Phi,        |Phi| <= T^2 a_max
 
-    The primitive is a spring that follows the target ``y(s)`` of the skill, with the skill's own gains K and D. T is
-    the duration [s]. The equation is integrated exactly in steps of 10 ms, during which ``Phi`` is constant. The motion
-    ends at the goal, but not before the learned duration. If the tool is not within 5 mm of the goal after twice the
-    duration, the method refuses the scene.
+    The primitive is a spring with damping that follows the target ``y(s)`` of the skill; its gains K and D are those of
+    the skill. T is the duration [s]. The equation is solved exactly in steps of 10 ms, during which ``Phi`` is
+    constant. The motion ends when the tool is at the goal, but not before the time T. If the tool is more than 5 mm
+    from the goal after the time 2 T, the method refuses the scene.
 
     A subclass implements :meth:`term`. The component of ``Phi`` in a forbidden direction is removed. The published
-    methods have no limit ``a_max``. The limit is needed because some terms grow without bound near an obstacle, and
-    would throw the tool far away within one step.
+    methods have no limit ``a_max``. Here, the limit is necessary, because some terms grow without bound near an
+    obstacle and could move the tool far away within one step.
 
     Args:
         skill: skill to reproduce.
-        max_acceleration: a_max [m/s^2].
+        max_acceleration: a_max, the largest acceleration that ``Phi`` may cause [m/s^2].
         options: arguments of :class:`~imitarm.policies.path_policy.PathPolicy`.
     """
 
@@ -97,17 +98,17 @@ class CoupledMotion(BaselinePolicy):
         """Return the coupling term Phi at a state, the sum over all obstacles, shape (3,) [m]."""
 
     def bounded_term(self, state: MotionState, limit: float) -> Array:
-        """Return the coupling term, at most ``limit`` [m], without its forbidden components, shape (3,) [m]."""
+        """Return the coupling term (3,) [m] without forbidden components, scaled down to the norm ``limit`` [m]."""
         phi = self.allowed(self.term(state))
         size = float(np.sqrt(phi.dot(phi)))
         return phi * (limit / size) if size > limit else phi
 
     def constrained(self, before: Array, after: Array, state: MotionState, step: float) -> Array:
-        """Return the state after a step; a subclass may change it.
+        """Return the position and the velocity after a step; a subclass may change them.
 
         Args:
-            before: [x; T x'] before the step, shape (2, 3) [m].
-            after: [x; T x'] after the step, as the equation gives it, shape (2, 3) [m].
+            before: position and scaled velocity [x; T x'] before the step, shape (2, 3) [m].
+            after: [x; T x'] after the step, as the equation of the primitive gives it, shape (2, 3) [m].
             state: state before the step, with the obstacles.
             step: length of the step, as a fraction of the duration.
         """
@@ -115,7 +116,7 @@ class CoupledMotion(BaselinePolicy):
         return after
 
     def reaction(self, nominal: Trajectory, position: Array, velocity: Array, fraction: float) -> Reaction:
-        """Return the motion of the spring, one control period at a time."""
+        """Return a motion of the primitive that advances by one control period at a time."""
         return _CoupledReaction(self, nominal, position, velocity, fraction)
 
     def target(self, nominal: Trajectory, fractions: Array) -> Array:
@@ -123,17 +124,17 @@ class CoupledMotion(BaselinePolicy):
 
         Args:
             nominal: the learned path between the start and the goal of this motion.
-            fractions: times divided by the duration, shape (n,).
+            fractions: times divided by the duration T, shape (n,).
         """
         begun = self.skill.dmp_.begin(nominal.positions[0], nominal.positions[-1])
         return begun.target.at(np.exp(-DECAY * fractions))
 
     def start_velocity(self) -> Array:
-        """Return v = T x' at the start, shape (3,) [m]."""
+        """Return the scaled velocity T x' at the start, shape (3,) [m]."""
         return self.skill.dmp_.start_velocity_ * self.skill.duration_
 
     def tool_path(self, nominal: Trajectory, gaps: ToolGaps, scene: Scene) -> tuple[Array, Array]:
-        """Return the motion of the spring with its coupling term.
+        """Return the path of the primitive with its coupling term.
 
         Raises:
             InfeasibleError: when the tool is not within 5 mm of the goal after twice the duration.
@@ -240,7 +241,7 @@ class Surroundings:
             z: [x; T x'], the position and the velocity times the duration T, shape (2, 3) [m].
             fraction: time divided by the duration.
             learned: position of the nominal path at this time, shape (3,) [m].
-            time: time for which the obstacles have moved from their poses in the scene [s]; None: the time since the
+            time: time since the stamp of the scene, for the positions of moving obstacles [s]; None: time since the
                 motion began.
         """
         x, v = z

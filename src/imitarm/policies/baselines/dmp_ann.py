@@ -46,13 +46,13 @@ class Inputs(NamedTuple):
 
 
 def inputs_of(state: MotionState, stiffness: float) -> Inputs:
-    r"""Return the inputs of the network at a state.
+    r"""Return the inputs of the network, and the linear maps of its outputs, for one state of the motion.
 
     Each obstacle has a frame ``Q = [v_r / |v_r|, p, b]``. The first axis is the direction of the relative velocity
     ``v_r``. The second axis ``p`` is perpendicular to the first and points towards the obstacle. The third axis ``b``
-    is perpendicular to both. In this frame, the features do not change when the scene is rotated. Let ``r`` be the
-    vector from the tool to the closest point, ``d`` the gap, ``theta`` the angle between ``v_r`` and ``r``, and ``s``
-    the phase. The features are::
+    is perpendicular to both. Features in this frame do not change when the whole scene is rotated. Let ``r`` be the
+    vector from the tool to the obstacle's closest point, ``d`` the gap, ``theta`` the angle between ``v_r`` and ``r``,
+    ``s`` the phase, and ``x - x_0`` the deviation from the learned path. The ten features are::
 
         d / 0.1 m, |v_r|, cos(theta), sin(theta), Q^T r / 0.1 m (3), s, |x - x_0| / 0.05 m, 1
 
@@ -60,7 +60,7 @@ def inputs_of(state: MotionState, stiffness: float) -> Inputs:
 
     Args:
         state: state of the motion.
-        stiffness: K.
+        stiffness: stiffness K of the primitive.
     """
     v, n = state.relative, state.normal
     speed = np.sqrt(np.einsum("nd,nd->n", v, v))
@@ -91,33 +91,35 @@ def inputs_of(state: MotionState, stiffness: float) -> Inputs:
 class DMPANN(CoupledMotion):
     r"""DMP+ANN: a primitive with a learned coupling term (after Rai et al. 2017).
 
-    For each obstacle, one small network NN computes a vector in a frame that moves with the tool. The coupling term is
-    the weighted sum of these vectors::
+    A small network NN computes one vector for each obstacle, in a frame Q that moves with the tool. The coupling term
+    is a weighted sum of these vectors over the obstacles::
 
         Phi = gain K s sum exp(-d / 0.1 m) Q NN(features)
 
     :func:`inputs_of` explains the features and the frame Q. The network has two layers of 32 units with tanh. The
-    factor ``s`` is the phase of the primitive; it decays to 0, so the motion always ends at the goal.
+    factor ``s`` is the phase of the primitive. It decays to 0, so the coupling term vanishes at the end of the motion.
 
-    **Training.** The expert is the optimiser of :mod:`~imitarm.policies.baselines.expert`, which is independent of the
-    compared methods. The expert's path in a scene is the nominal path plus a deviation ``e(t)``; the coupling term ``C
-    = K e + D T e' + T^2 e''`` produces this path. The network first learns C along the expert's paths around one
-    obstacle. Then, in three rounds, it also learns C in the states that its own motions visit (DAgger, Ross et al.
-    2011). A network that is trained on the squared error returns means, and these are too small to keep the clearance.
-    The factor ``gain`` corrects this; its value is chosen in validation scenes. ``python -m
-    imitarm.benchmark.train_ann`` trains the network; the package contains its weights.
+    **Training.** The expert is an optimiser (:mod:`~imitarm.policies.baselines.expert`), which is independent of the
+    compared methods. The expert's path in a scene is the nominal path plus a deviation ``e(t)``. A primitive with the
+    coupling term ``C = K e + D T e' + T^2 e''`` moves along this path. The network first learns C along the expert's
+    paths around one obstacle. Then, in three rounds, it also learns C in the states that its own motions visit (DAgger,
+    Ross et al. 2011). A network that minimises the squared error returns mean values, which are too small to keep the
+    clearance. The factor ``gain`` compensates for this; its value was chosen in validation scenes. The package contains
+    the trained weights. The command ``python -m imitarm.benchmark.train_ann`` trains the network again.
 
-    **Changes.** The paper learns from demonstrations by persons. In the paper, a further step reduces the output to
-    zero when the tool has passed the obstacle or is at the goal. Here, the factors ``s`` and ``exp(-d / 0.1 m)`` have
-    this effect.
+    **Changes.** The network of the paper learns from human demonstrations. In the paper, a separate step sets the
+    output to zero when the tool has passed the obstacle or is at the goal. Here, the factors ``s`` and ``exp(-d / 0.1
+    m)`` have this effect.
 
     **Known failure.** The expert passes an obstacle on one of two sides. If the tool moves straight at the obstacle,
-    its state does not tell which side the expert chooses. Near such states, the network returns a mean of both sides.
-    The training scenes have only one obstacle; for several obstacles, the terms are added.
+    the features do not show which side the expert chooses. The network then returns a mean of the terms for both sides,
+    which does not avoid the obstacle. The training scenes have only one obstacle. For several obstacles, the terms are
+    added, which the training does not cover.
 
     Args:
         skill: skill to reproduce.
-        gain: factor of the term; None: the gain that was chosen for the package's weights, or 1 for another network.
+        gain: factor of the coupling term; None: the factor chosen for the network of the package, or 1 for another
+            network.
         network: trained network; None: the network of the package.
         options: arguments of :class:`~imitarm.policies.baselines.coupled_motion.CoupledMotion`.
     """
@@ -150,11 +152,12 @@ _FORMAT = "imitarm dmp-ann weights 1"
 
 
 class Weights(NamedTuple):
-    """A trained network and its origin.
+    """A trained network, and a record of its training.
 
     Attributes:
         network: the network.
-        provenance: command, seed, version of the code, numbers of scenes, validation loss, gain, training time.
+        provenance: record of the training: command, seed, version of the code, numbers of scenes, validation loss,
+            chosen gain and training time.
     """
 
     network: MLP
@@ -209,6 +212,6 @@ def load_weights(path: str | os.PathLike[str]) -> Weights:
 
 @lru_cache(maxsize=1)
 def packaged_weights() -> Weights:
-    """Return the weights that the package contains."""
+    """Return the trained network that the package contains."""
     with resources.as_file(resources.files("imitarm.policies.baselines") / _PACKAGED) as path:
         return load_weights(path)

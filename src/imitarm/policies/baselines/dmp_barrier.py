@@ -1,4 +1,4 @@
-"""DMP with a barrier: a dynamic movement primitive whose velocity is filtered so that the clearance is kept."""
+"""DMP with a barrier: a dynamic movement primitive (DMP) with a velocity filter that keeps the clearance."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 class DMPBarrier(CoupledMotion):
-    r"""The motion of a primitive whose velocity is changed as little as possible to keep the clearance.
+    r"""Follow a movement primitive, and change its velocity as little as possible to keep the clearance.
 
     In each step, the spring of the primitive proposes the velocity u. The tool moves with the velocity v that solves
 
@@ -25,7 +25,7 @@ class DMPBarrier(CoupledMotion):
 
     Here, :math:`h_o` is the distance to obstacle o minus the required clearance, :math:`n_o` is the outward normal, and
     :math:`v_o` is the velocity of the obstacle's closest point. The spring starts each step at the actual position of
-    the tool. The farther the tool falls behind, the harder the spring pulls. The method combines a dynamic movement
+    the tool, so it pulls harder the farther the tool is behind its target. The method combines a dynamic movement
     primitive with a control barrier function (Ames et al. 2019).
 
     **Known failure.** The tool stops in front of an obstacle that it approaches head on, as with every barrier
@@ -33,7 +33,7 @@ class DMPBarrier(CoupledMotion):
 
     Args:
         skill: skill to reproduce.
-        gamma: largest rate at which the gap may shrink, divided by the gap [1/s].
+        gamma: factor [1/s]; the gap :math:`h_o` [m] may shrink by at most :math:`\gamma h_o` [m/s].
         options: arguments of :class:`~imitarm.policies.baselines.coupled_motion.CoupledMotion`.
     """
 
@@ -48,7 +48,7 @@ class DMPBarrier(CoupledMotion):
         return np.zeros(3)
 
     def constrained(self, before: Array, after: Array, state: MotionState, step: float) -> Array:
-        """Return [x; T x'] after a step whose velocity keeps all gaps."""
+        """Return position and scaled velocity [x; T x'] after a step with the velocity v of the class docstring."""
         proposed = (after[0] - before[0]) / step
         rows = np.concatenate([state.normal, -self._forbidden])
         duration = self.skill.duration_

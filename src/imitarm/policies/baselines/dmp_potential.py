@@ -1,4 +1,4 @@
-"""DMP+AT (b): a primitive with a dynamic potential field around obstacles (Park et al. 2008)."""
+"""A movement primitive with a dynamic potential field (Park et al. 2008); one form of the thesis's DMP+AT."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def dynamic_force(velocity: Array, normal: Array, distance: Array, reach: Array,
         -grad U = lambda (-cos)^(beta - 1) |v| / p (beta grad(cos) - cos / p n),   grad(cos) = (v / |v| - cos n) / reach
 
     Args:
-        velocity: v, shape (n, 3).
-        normal: n, shape (n, 3).
+        velocity: v, as for :func:`dynamic_potential`, shape (n, 3) [m].
+        normal: n, as for :func:`dynamic_potential`, shape (n, 3).
         distance: p, distance of the tool to each obstacle, above 0, shape (n,) [m].
         reach: distance from the tool's tip to the closest point, above 0, shape (n,) [m].
         gain: lambda.
@@ -59,8 +59,8 @@ def dynamic_force(velocity: Array, normal: Array, distance: Array, reach: Array,
 class DMPPotential(CoupledMotion):
     r"""DMP with a dynamic potential field, the avoidance term of Park et al. (2008).
 
-    The potential depends on the direction and the speed of the motion: it is 0 while the tool moves away from the
-        obstacle. It increases with the speed of approach, and as the distance decreases::
+    The potential U depends on the direction and the speed of the motion. U is 0 while the tool moves away from the
+    obstacle. While the tool approaches the obstacle, U increases with the speed and with decreasing distance::
 
         U = lambda (-cos theta)^beta |v_r| / p    if cos theta < 0, else 0;      Phi = -sum grad U
 
@@ -68,17 +68,17 @@ class DMPPotential(CoupledMotion):
     and the direction from the closest point of the obstacle to the tool. ``p`` is the distance between tool and
     obstacle, minus the required clearance.
 
-    **Changes.** The published field surrounds points of the obstacle. Here, the field surrounds only the closest point,
-    which the gradient treats as fixed. The published velocity is the tool's own velocity, not the velocity relative to
-    the obstacle. Here, distances below 5 mm count as 5 mm.
+    **Changes.** The paper places a field around every point of the obstacle. Here, only the closest point has a field,
+    and the gradient treats this point as fixed. The paper uses the velocity of the tool instead of the relative
+    velocity ``v_r``. Here, distances below 5 mm count as 5 mm.
 
     **Known failure.** If the tool moves straight at an obstacle, the gradient is parallel to the motion. The field then
     only slows the tool down and does not deflect it. The tool arrives late, or stays in front of the obstacle.
 
     Args:
         skill: skill to reproduce.
-        gain: lambda [m].
-        exponent: beta, at least 1.
+        gain: lambda, the factor of the potential [m].
+        exponent: beta, the exponent of the cosine, at least 1.
         options: arguments of :class:`~imitarm.policies.baselines.coupled_motion.CoupledMotion`.
     """
 

@@ -1,4 +1,4 @@
-"""DMP+AT (a): a primitive that steers around obstacles (Hoffmann et al. 2009)."""
+"""A movement primitive that steers around obstacles (Hoffmann et al. 2009); one form of the thesis's DMP+AT."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def steering_rate(angle: Array, gain: float, decay: float) -> Array:
     The rate is largest at ``theta = 1 / beta``, where it is ``gamma / (beta e)``.
 
     Args:
-        angle: theta, from 0 (towards the obstacle) [rad].
+        angle: theta, angle between the velocity and the direction to the obstacle [rad].
         gain: gamma.
         decay: beta [1/rad].
     """
@@ -33,19 +33,20 @@ def steering_rate(angle: Array, gain: float, decay: float) -> Array:
 class DMPSteering(CoupledMotion):
     r"""DMP with steering, the avoidance term of Hoffmann et al. (2009).
 
-    Let ``v_r = v - v_o`` be the velocity relative to the obstacle, ``n`` the outward normal at the closest point, and
-    ``theta`` the angle between ``v_r`` and the direction ``-n`` to that point. The term rotates the velocity away from
-    the obstacle, in the plane of ``v_r`` and ``n``. It acts only while the tool approaches the obstacle::
+    Let ``v_r = v - v_o`` be the velocity relative to the obstacle, ``n`` the outward normal at the obstacle's closest
+    point, and ``theta`` the angle between ``v_r`` and ``-n``. The term ``Phi`` rotates the velocity away from the
+    obstacle, in the plane of ``v_r`` and ``n``. ``Phi`` acts only while the tool approaches the obstacle::
 
         Phi = sum gamma theta exp(-beta theta) |v_r| u exp(-kappa d)      if theta < 90 degrees
         u = (n + cos(theta) v_r / |v_r|) / sin(theta)                     unit vector perpendicular to v_r
 
-    **Changes.** The published term uses the centre of a point obstacle and has no factor ``exp(-kappa d)``, so an
-    obstacle 50 m away bends the path as much as a near obstacle. Here, the closest point represents the obstacle, and
-    ``d`` is the distance from the tool to the obstacle, minus the required clearance.
+    **Changes.** In the paper, an obstacle is a point. Here, the obstacle's closest point takes its place. The term of
+    the paper does not depend on the distance, so an obstacle 50 m away bends the path as much as a near obstacle. Here,
+    the factor ``exp(-kappa d)`` reduces the term, where ``d`` is the distance from tool to obstacle, minus the required
+    clearance.
 
     **Known failure.** The term is 0 for ``theta = 0``: the tool goes straight into an obstacle that it approaches head
-    on. The term also guarantees no clearance, because its rate of rotation is bounded, however near the obstacle is.
+    on. The term does not guarantee a clearance, because its rate of rotation is bounded, even very near the obstacle.
 
     Args:
         skill: skill to reproduce.

@@ -1,4 +1,4 @@
-"""Elastic band (Quinlan and Khatib 1993): a path with tension, repelled by obstacles."""
+"""Elastic band (Quinlan and Khatib 1993): a path under tension that obstacles repel."""
 
 from __future__ import annotations
 
@@ -26,20 +26,21 @@ class ElasticBand(BaselinePolicy):
     r"""Displace the learned path like an elastic band (Quinlan and Khatib 1993).
 
     The band has nodes ``x_i = x0_i + d_i``, which are the learned positions ``x0_i`` plus displacements ``d_i``. A
-    tension pulls each node towards its neighbours. An obstacle o repels a node along its normal ``n_o`` if their gap
-    beyond the clearance is smaller than the influence distance ``d_0``::
+    tension pulls each node towards its neighbours. Let ``gap_o`` be the distance from obstacle o to the tool at a node,
+    minus the required clearance. If ``gap_o`` is smaller than the influence distance ``d_0``, the obstacle repels the
+    node along the obstacle's normal ``n_o``::
 
         F_i = (d_(i-1) - 2 d_i + d_(i+1)) + k sum_o max(d_0 - gap_o(x_i), 0) n_o
 
     The start and the goal are fixed. The equilibrium minimises an energy:
     ``1/2 sum |d_(i+1) - d_i|^2 + k/2 sum max(d_0 - gap, 0)^2``.
-    Newton steps, which treat the normals as constant, find this minimum. Like the published band, the band starts from
-    a free path. This is the learned path, displaced around each obstacle to the side that needs the least jerk.
+    Newton steps, which treat the normals as constant, find this minimum. The first band is a collision-free path, as in
+    the paper: the learned path, displaced around each obstacle to the side that needs the least jerk.
 
     Args:
         skill: skill to reproduce.
         repulsion: k, stiffness of the repulsion divided by the stiffness of the tension.
-        influence: d_0 [m].
+        influence: d_0, the gap below which an obstacle repels [m].
         options: arguments of :class:`~imitarm.policies.baselines.baseline_policy.BaselinePolicy`.
     """
 

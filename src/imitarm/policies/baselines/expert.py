@@ -1,11 +1,11 @@
 r"""The expert: paths of least jerk around obstacles, found by sequential quadratic programming.
 
-The baselines that learn (``gmm-irl``, ``dmp-ann``) are trained with these paths. In benchmarks, the paths show how well
-an independent optimiser does. It uses no part of the compared methods: no Gaussian components, no motion primitive and
-no potential.
+The baselines that learn (``gmm-irl``, ``dmp-ann``) are trained with these paths. In benchmarks, the paths show which
+result an independent optimiser reaches. The optimiser uses no part of the compared methods: no Gaussian components, no
+motion primitive and no potential.
 
-Let ``x_i`` be the nominal path and ``x_i + d_i`` the path to find, with ``i = 0..99``. The deviation minimises the
-integral of its squared jerk, written with third differences, under exact constraints on the gap ``g_o`` to every
+Let ``x_i`` be the nominal path and ``x_i + d_i`` the path to find, with ``i = 0..99``. The deviation ``d_i`` minimises
+the integral of its squared jerk, computed from third differences. The constraints limit the gap ``g_o`` to every
 obstacle ``o``::
 
     min  1 / dt^5 sum_i |d_(i+3) - 3 d_(i+2) + 3 d_(i+1) - d_i|^2
@@ -14,9 +14,9 @@ obstacle ``o``::
 
 The zero deviations at both ends keep the nominal velocity and acceleration at the start and at the goal. All obstacles
 are convex, so the gap is a convex function of the position. Its tangent ``g_o(y_i) + n_o . (x_i + d_i - y_i)`` at any
-path ``y`` is therefore never larger than the gap. The quadratic program has these tangents as constraints, so its
-solution also keeps the exact constraints. The tangents at the solution give the next quadratic program, whose cost is
-at most as large. The iteration ends at a point that meets the first-order optimality conditions.
+path ``y`` is therefore never larger than the gap. Each quadratic program has tangents as constraints, so its solution
+also keeps the constraints on the gaps. The tangents at this solution are the constraints of the next quadratic program,
+whose cost is not larger. The iteration converges to a path that meets the first-order optimality conditions.
 """
 
 from __future__ import annotations
@@ -53,22 +53,22 @@ _SOLVED = 1  # daqp's exit flag of an optimal solution
 
 
 def expert_paths(nominal: Trajectory, gaps: ToolGaps, *, clearance: float, forbidden: ArrayLike = ()) -> list[Array]:
-    """Return all locally optimal paths around the obstacles that were found; the path of least jerk comes first.
+    """Find locally optimal paths around the obstacles; return them in the order of their jerk, the smallest first.
 
-    The optimiser starts from several displaced paths. Each stretch of the nominal path that is too close to an obstacle
-    is displaced in 8 directions around the path. The result is deterministic.
+    The optimiser starts from several displaced paths. For each of these paths, every part of the nominal path that is
+    too close to an obstacle is displaced in one of 8 directions. The result is deterministic.
 
     Args:
         nominal: the path without obstacles.
         gaps: distances to the obstacles; a moving obstacle is placed where it is at the time of each sample.
-        clearance: smallest gap of the samples [m]. Between two samples at a distance ``h``, the gap of the polyline can
-            be smaller by up to ``h^2 / (8 (clearance + radius of the tool))``.
-        forbidden: directions in which the path must not leave the nominal path, shape (m, 3).
+        clearance: required gap at the samples [m]. Between two samples at the distance ``h``, the gap may be smaller by
+            up to ``h^2 / (8 (clearance + radius of the tool))``.
+        forbidden: directions in which the path must not be displaced from the nominal path, shape (m, 3).
 
     Returns:
         Positions at 100 equally spaced times, each of shape (100, 3) [m]; empty if no path was found, for example
         because the start is too close to an obstacle. Paths that deviate from the nominal path by more than 0.5 m are
-        left out. Such paths can have the least jerk if an obstacle is close to the start.
+        not returned.
     """
     clearance = finite_number(clearance, "expert_paths: clearance", "m", at_least=0.0)
     directions = finite_array(np.reshape(np.asarray(forbidden, dtype=float), (-1, 3)), (None, 3), "forbidden")
@@ -99,8 +99,8 @@ class PathProblem(NamedTuple):
         times: times of the samples since the motion began, shape (100,) [s].
         gaps: distances to the obstacles.
         clearance: required gap [m].
-        axes: orthonormal basis of the d directions that are permitted at least one way, as columns, shape (3, d).
-        one_sided: directions that are forbidden only one way, in the basis ``axes``, shape (m, d).
+        axes: orthonormal basis of the space in which the path may be displaced, as d columns, shape (3, d).
+        one_sided: forbidden directions whose opposites are allowed, in the basis ``axes``, shape (m, d).
     """
 
     nominal: Array
@@ -112,7 +112,7 @@ class PathProblem(NamedTuple):
 
     @classmethod
     def of(cls, nominal: Trajectory, gaps: ToolGaps, clearance: float, forbidden: Array) -> PathProblem:
-        """Sample the nominal path; ``forbidden`` has shape (m, 3)."""
+        """Return the problem for a nominal path; ``forbidden`` are its forbidden directions, shape (m, 3)."""
         times = nominal.times[0] + np.linspace(0.0, nominal.duration, N_SAMPLES)
         axes, one_sided = allowed_axes(forbidden / np.linalg.norm(forbidden, axis=1, keepdims=True))
         return cls(nominal.at(times)[0], times - times[0], gaps, clearance, axes, one_sided)
@@ -127,7 +127,7 @@ class PathProblem(NamedTuple):
         return jerk_cost(path - self.nominal, float(self.times[1]))
 
     def keeps_clearance(self, path: Array) -> bool:
-        """Whether the samples keep the clearance and the limit of deviation, and no segment jumps over an obstacle."""
+        """Whether all samples keep the clearance and deviate by at most 0.5 m, with no obstacle between two samples."""
         strays = np.linalg.norm(path - self.nominal, axis=1).max() > _FARTHEST
         if strays or self.gaps_at(path)[0].min() < self.clearance - _KEPT:
             return False
@@ -167,11 +167,10 @@ def _least_jerk(samples: NDArray[np.intp], directions: Array, lower: Array) -> A
 
 
 def displaced_paths(problem: PathProblem) -> list[Array]:
-    """Return paths (100, 3) on all sides of the obstacles, from which an optimiser can start.
+    """Return paths (100, 3) on different sides of the obstacles, from which an optimiser can start.
 
-    Each stretch of the nominal path that is too close to an obstacle is displaced in several directions around the
-    path, by the deviation of least jerk. If there are several stretches, only the best direction of each stretch is
-    combined with the others.
+    Each part of the nominal path that is too close to an obstacle is displaced in several directions, by the deviation
+    of least jerk. If several parts are too close, at most 16 combinations of the best directions are returned.
     """
     too_close = problem.gaps_at(problem.nominal)[0].min(axis=0, initial=np.inf) < problem.clearance
     edges = np.flatnonzero(np.diff(np.concatenate([[False], too_close, [False]]).astype(int)))

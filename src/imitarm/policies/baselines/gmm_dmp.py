@@ -1,4 +1,4 @@
-"""GMM+DMP: a spring that follows a mixture of attractors (Calinon et al. 2012), repelled by obstacles."""
+"""GMM+DMP: a spring that follows a learned attractor (Calinon et al. 2012), with a repulsion from obstacles."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def reconstructed_demonstrations(skill: Skill, n_samples: int = _SAMPLES) -> lis
 
 
 def attractor_of(path: Trajectory, skill: Skill) -> Trajectory:
-    """Return the attractor ``y = x + (D/K) T x' + (T^2/K) x''`` of a path, for the gains of a skill.
+    """Return the attractor ``y = x + (D/K) T x' + (T^2/K) x''`` of a path; K and D are the gains of the skill.
 
-    A spring that follows this attractor moves along the path. The function fits a motion primitive to the path and
-    returns the primitive's target, so the samples need not be differentiated twice.
+    A spring that follows this attractor moves along the path. The function does not differentiate the samples twice.
+    Instead, it fits a motion primitive to the path and returns the primitive's target.
     """
     primitive = DMP(skill.dmp_.gains_, n_basis=skill.dmp_.n_basis).fit(path, exact_ends=True)
     phases = np.exp(-DECAY * (path.times - path.times[0]) / path.duration)
@@ -51,10 +51,11 @@ def attractor_of(path: Trajectory, skill: Skill) -> Trajectory:
 
 
 class GMMDMP(CoupledMotion):
-    r"""GMM+DMP: a spring that follows a mixture of attractors (Calinon et al. 2012).
+    r"""GMM+DMP: a spring that follows an attractor learned by a Gaussian mixture (Calinon et al. 2012).
 
-    The attractor of every demonstration is ``y = x + (D/K) T x' + (T^2/K) x''``. A Gaussian mixture is fitted to time
-    and attractor. Its regression gives the mean attractor ``y(t)`` and the covariance. The motion is::
+    The attractor of a demonstration ``x(t)`` with the duration T is ``y = x + (D/K) T x' + (T^2/K) x''``. A Gaussian
+    mixture is fitted to the times and attractors of all demonstrations. Gaussian mixture regression gives the mean
+    attractor ``y(t)`` and its covariance. The motion is::
 
         T^2 x'' = K (y(t) - x) - D T x' + Phi,        Phi = sum k (1/d - 1/d_0) d^-2 n     (thesis Eq 2.19)
 
@@ -62,22 +63,22 @@ class GMMDMP(CoupledMotion):
     :mod:`~imitarm.policies.baselines.potential_field`; with ``force=0``, the method is the published one.
 
     **Changes.** A skill does not keep its demonstrations; :func:`reconstructed_demonstrations` replaces them. The
-    mixture is over the time t instead of the phase ``s = exp(-alpha t / T)``. The phase decays exponentially, so one
-    Gaussian over the phase would cover the whole second half of the motion, and the motion would end beside the goal.
+    mixture is over the time t instead of the phase ``s = exp(-alpha t / T)``. Because the phase decays exponentially,
+    one Gaussian over the phase would cover the second half of the motion. The motion would then end beside the goal.
 
-    **Known failure.** The repulsion depends on the position alone. In front of a wide obstacle, the repulsion balances
-    the spring until the attractor has passed the obstacle. The spring then pulls the tool through the obstacle, or the
-    tool arrives late.
+    **Known failure.** The repulsion depends only on the position. In front of a wide obstacle, spring and repulsion
+    balance, and the tool waits until the attractor has passed the obstacle. Then the spring pulls the tool through the
+    obstacle, or the tool arrives late.
 
     Args:
         skill: skill to reproduce.
-        force: k [m^4].
-        influence: d_0 [m].
-        variable_stiffness: whether K is multiplied by ``clip(mean variance / variance(t), 0.3, 3)``, where the variance
-            is that of the attractor. The spring is then stiff where the demonstrations agree. A motion without
-            obstacles does not change.
-        n_components: number of Gaussians; None: twice the skill's number, because an attractor bends more than its
-            path.
+        force: k, the factor of the repulsion [m^4].
+        influence: d_0, the gap below which an obstacle repels [m].
+        variable_stiffness: whether K is multiplied by ``clip(mean variance / variance(t), 0.3, 3)``, so that the spring
+            is stiff where the demonstrations agree. Here, ``variance(t)`` is the trace of the attractor's covariance. A
+            motion without obstacles does not change.
+        n_components: number of Gaussians; None: twice the number of the skill, because an attractor has more curvature
+            than its path.
         options: arguments of :class:`~imitarm.policies.baselines.coupled_motion.CoupledMotion`.
     """
 
@@ -107,14 +108,14 @@ class GMMDMP(CoupledMotion):
         self._ratios = np.clip(variance.mean() / variance, *_STIFFNESS_RANGE)
 
     def target(self, nominal: Trajectory, fractions: Array) -> Array:
-        """Return the mean attractor; a new start or goal moves it as it moves the target of the skill's primitive."""
+        """Return the mean attractor, shifted for a new start or goal like the target of the skill's primitive."""
         primitive, phases = self.skill.dmp_, np.exp(-DECAY * fractions)
         moved = primitive.begin(nominal.positions[0], nominal.positions[-1]).target.at(phases)
         learned = primitive.begin().target.at(phases)
         return np.asarray(self.regression_.nominal(fractions * self.skill.duration_)[0] + moved - learned)
 
     def term(self, state: MotionState) -> Array:
-        """Return the repulsion, and the force of the additional stiffness, shape (3,) [m]."""
+        """Return the repulsion plus the force of the variable stiffness, shape (3,) [m]."""
         phi = repulsive_force(state.distance, state.normal, self.force, self.influence)
         if self.variable_stiffness:
             ratio = self._ratios[min(round(state.fraction * (_SAMPLES - 1)), _SAMPLES - 1)]

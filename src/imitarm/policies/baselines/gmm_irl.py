@@ -48,25 +48,25 @@ def learned_weights() -> dict[str, float]:
 
 
 class GmmIrl(BaselinePolicy):
-    r"""Follow the path of least cost; the weights of the cost were learned from demonstrated detours.
+    r"""Follow the path of least cost, with a cost whose weights were learned from the paths of an expert.
 
     The cost ``J = sum_k w_k phi_k`` has features ``phi_k`` with weights ``w_k``. The features measure the deviation
     from the learned path, the jerk of the deviation, and the nearness to obstacles
-    (:mod:`imitarm.policies.baselines.path_cost`). The weights were learned by maximum-entropy inverse reinforcement
-    learning from the optimal paths of an independent expert in other scenes (:mod:`imitarm.benchmark.train_irl`).
-    The optimiser L-BFGS starts from the learned path and from paths that are displaced to each side. Each start leads
-    to a local minimum; the policy follows the minimum of least cost.
+    (:mod:`imitarm.policies.baselines.path_cost`). The expert is an optimiser
+    (:mod:`~imitarm.policies.baselines.expert`). Its paths in other scenes gave the weights, by maximum-entropy inverse
+    reinforcement learning (:mod:`imitarm.benchmark.train_irl`). The optimiser L-BFGS starts from the learned path, and
+    from paths that are displaced to each side of the obstacles. Each start leads to a local minimum; the policy follows
+    the path of the minimum with the least cost.
 
-    Among obstacles that move, the cost is minimised again 30 times a second over the next 20 points
-    (:class:`HorizonReaction`).
-
-    The distance to obstacles enters as a cost, not as a constraint, so the path may not keep the required clearance.
+    While obstacles move, the policy minimises the cost 30 times a second over the next 20 points
+    (:class:`HorizonReaction`). The distance to obstacles is a part of the cost and not a constraint. The path may
+    therefore violate the required clearance.
 
     Args:
         skill: skill to reproduce.
         weights: weight of each feature in ``path_cost.FEATURES``; None: the learned weights.
-        closeness: factor of the weight of the deviation.
-        avoidance: factor of the weights of the obstacles.
+        closeness: additional factor of the weight of the feature "deviation".
+        avoidance: additional factor of the weights of the three features "obstacles".
         margin: distance that is subtracted from each gap [m].
         options: arguments of :class:`~imitarm.policies.baselines.baseline_policy.BaselinePolicy`.
     """
@@ -96,7 +96,7 @@ class GmmIrl(BaselinePolicy):
         self.margin = finite_number(margin, "GmmIrl: margin", "m", at_least=0.0)
 
     def reaction(self, nominal: Trajectory, position: Array, velocity: Array, fraction: float) -> Reaction:
-        """Return the motion along paths of least cost over a receding horizon."""
+        """Return a motion that plans the path of least cost again and again, over the next 20 points."""
         axes, one_sided = allowed_axes(self._forbidden)
         cost = Weighted(self.skill, self.weights, self.margin, axes, one_sided, self.tool_spheres)
         return HorizonReaction(cost, nominal, position, velocity, fraction)
@@ -113,7 +113,7 @@ class GmmIrl(BaselinePolicy):
 
 
 def path_cost(problem: PathProblem, skill: Skill, margin: float = 0.0) -> PathCost:
-    """Return the features of paths in a scene, with the covariances of a skill; ``margin`` reduces each gap [m]."""
+    """Return the cost of paths in a scene for one skill; ``margin`` [m] is subtracted from each gap."""
     covariances = skill.gmr_.predict(problem.times / problem.times[-1] * skill.duration_)[1]
     return PathCost(problem.nominal, covariances, problem.times, problem.gaps, margin, problem.axes, problem.one_sided)
 
@@ -127,7 +127,8 @@ class Weighted(NamedTuple):
         margin: distance that is subtracted from each gap [m].
         axes: orthonormal basis of the allowed directions, as columns, shape (3, k).
         one_sided: directions in which the path must not be displaced, in the basis ``axes``, shape (m, k).
-        tool_spheres: spheres that contain the tool, or None.
+        tool_spheres: spheres that contain the tool, rows x y z r in the tool's frame, shape (m, 4) [m]; None: the tool
+            is a point.
     """
 
     skill: Skill
@@ -209,10 +210,10 @@ class _Horizon:
 
 
 class HorizonReaction(Reaction):
-    """Plan the path of least cost over the next 20 points, which last 0.4 of the duration, 30 times a second.
+    """A motion that plans the path of least cost 30 times a second, over the next 40 % of the duration (20 points).
 
-    The obstacles are predicted with constant velocities. L-BFGS starts from the last plan, from the learned path, and
-    from paths that are displaced to the sides.
+    Each plan assumes that the obstacles keep their velocities. The optimiser L-BFGS starts from the last plan, from the
+    learned path, and from paths that are displaced to the sides.
     """
 
     def __init__(self, cost: Weighted, nominal: Trajectory, position: Array, velocity: Array, fraction: float) -> None:
@@ -225,7 +226,7 @@ class HorizonReaction(Reaction):
             self._plan[1] = self._spacing * (velocity - learned) @ cost.axes
 
     def step(self, scene: Scene, dt: float) -> None:
-        """Plan again if the last plan is old, then follow the plan for one step."""
+        """Plan again if the last plan is older than 1/30 s, then follow the plan for one control period."""
         if self._age >= PERIOD - 1e-9:
             self._plan, self._age = self._planned(scene), 0.0
         self._age += dt

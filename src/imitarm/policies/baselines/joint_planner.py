@@ -1,20 +1,21 @@
 r"""RRT-Connect in joint space: find any joint path to the goal on which the whole arm is clear.
 
-Two trees of joint postures grow, one from the start and one from the postures at the goal. They grow towards random
-postures and towards each other (Kuffner and LaValle, "RRT-Connect: an efficient approach to single-query path
+Two trees of joint postures grow: one from the start posture, the other from the goal postures. The trees grow towards
+random postures and towards each other (Kuffner and LaValle, "RRT-Connect: an efficient approach to single-query path
 planning", ICRA 2000). An edge is a straight line between two postures, :math:`q(s) = a + s (b - a)`. An edge may be
 used if
 
 .. math:: d(q(s)) \ge d_{req}, \qquad \angle\big(R(q(s)),\, R_0(q(s))\big) \le \tau
 
-for all :math:`s` in [0, 1]. Here, d stands for every distance from a sphere of the arm to an obstacle and for every
-distance between links. The certificate of the arm (``arm_certificate``) bounds these distances on the whole edge. R is
-the rotation of the tool, :math:`R_0` the learned rotation at the nearest place of the learned path, and :math:`\tau`
-the limit of the tilt. The tilt is checked at samples of the edge. The planner uses nothing else of the demonstrations.
-It is a baseline: a comparison with it shows the costs and the benefits of keeping to the demonstrated motion.
+for all :math:`s` in [0, 1]. Here, d is any distance between the arm and an obstacle, or between two links.
+:math:`d_{req}` is the required clearance. The module ``arm_certificate`` computes lower bounds of these distances on
+the whole edge. R is the rotation of the tool, and :math:`R_0` is the learned rotation at the nearest point of the
+learned path. The angle between the two, the tilt, is checked at samples of the edge against its limit :math:`\tau`. The
+planner uses nothing else from the demonstrations. A comparison with this baseline shows what it costs to follow the
+demonstrated motion, and what one gains.
 
-The library ompl grows the trees. The checks of the edges are written in Python; one array operation handles all samples
-of an edge and all spheres. Therefore most of the planning time is spent in this Python code, not in ompl.
+The library ompl grows the trees. The code that checks the edges is written in Python, with array operations over all
+samples of an edge. Most of the planning time is spent in this code, not in ompl.
 """
 
 from __future__ import annotations
@@ -65,10 +66,10 @@ _SAME_POSTURE = 1e-4  # [m, rad] the joints are planned from exactly where the a
 
 @dataclass(frozen=True, eq=False)
 class TiltLimit:
-    """Limit of the tool's tilt: its rotation away from the learned rotation at the nearest place of the learned path.
+    """Limit of the tool's tilt: its rotation away from the learned rotation at the nearest point of the learned path.
 
     Attributes:
-        learned: the learned path with its rotations, n samples.
+        learned: the learned path with its rotations, with n samples.
         largest: largest permitted rotation at each sample, shape (n,) [rad].
     """
 
@@ -76,13 +77,13 @@ class TiltLimit:
     largest: Array
 
     def excess(self, path: ArmPath) -> Array:
-        """Return by how much the tilt exceeds its limit in each posture, shape (m,) [rad]; negative if it does not."""
+        """Return the tilt minus its limit in each posture of ``path``, shape (m,) [rad]."""
         tilt, nearest = tilts(self.learned, path.positions, path.quaternions)
         return np.asarray(tilt - self.largest[nearest])
 
 
 class ClearMotions:
-    """Tells which postures and which straight joint motions keep the arm's clearances and the limit of the tilt.
+    """Checks whether postures and straight joint motions keep the arm's clearances and the limit of the tilt.
 
     Args:
         around: the arm, its obstacles (at rest) and the required clearances.
@@ -94,12 +95,12 @@ class ClearMotions:
         self._step = _STEP if tilt is None else _TILT_STEP
 
     def posture(self, joints: Array) -> bool:
-        """Return whether a posture (n_joints,) [rad] may be used."""
+        """Return whether a posture (n_joints,) [rad] keeps the clearances and the limit of the tilt."""
         path = ArmPath.of(self.around.arm, joints[None])
         return self._upright(path) and self.around.clearance_at(path, np.zeros(1), 0.0).room >= 0.0
 
     def motion(self, start: Array, end: Array) -> bool:
-        """Return whether all postures on the straight line between two postures (n_joints,) [rad] may be used."""
+        """Return whether the whole straight line between two postures (n_joints,) [rad] keeps clearances and tilt."""
         n = 2 + int(np.abs(end - start).max() / self._step)
         path = ArmPath.of(self.around.arm, np.linspace(start, end, n))
         return self._upright(path) and self.around.clearance_of(path, np.zeros(n)).room >= 0.0
@@ -111,17 +112,19 @@ class ClearMotions:
 def find_joint_path(
     clear: ClearMotions, start: Array, goals: Sequence[Array], *, seconds: float = 10.0, seed: int = 1
 ) -> Array | None:
-    """Find straight joint motions from one posture to one of several goals; shorten them and round off their corners.
+    """Find a clear joint path from one posture to one of several goal postures, then shorten and smooth the path.
 
     Args:
-        clear: which postures and motions may be used.
+        clear: checks of postures and motions.
         start: first posture, shape (n_joints,) [rad].
-        goals: postures, each of shape (n_joints,) [rad]; the path ends in one of them.
-        seconds: limit of the search's computing time; shortening takes further time [s].
-        seed: seed of the random postures, at least 1. The same seed gives the same path if the computing time suffices.
+        goals: goal postures, each of shape (n_joints,) [rad]; the path ends in one of these postures.
+        seconds: limit of the search's computing time [s]; the time for shortening and smoothing is additional.
+        seed: seed of the random postures, at least 1. If the search does not run out of time, the same seed gives the
+            same path.
 
     Returns:
-        Corners of the path, shape (m, n_joints) [rad]; None when no path was found in time.
+        Postures along the path, shape (m, n_joints) [rad], with straight lines in between; None when no path was found
+        in time.
 
     Raises:
         InputError: when ompl is not installed.
@@ -183,14 +186,14 @@ def _ompl(seed: int) -> tuple[Any, Any]:
 
 
 class RRTConnect(PathPolicy):
-    """Move to the goal on the first clear joint path that a random search finds; the demonstrations are not used.
+    """Move to the goal on the first clear joint path that a random search finds; the motion is not the learned one.
 
-    The search begins in the measured posture and ends in a clear posture with the tool at the goal. The path found by
-    :func:`find_joint_path` is shortened, and its execution times keep the limits of the arm and of the safety filter.
+    The search starts in the measured posture and ends in a clear posture with the tool at the goal, see
+    :func:`find_joint_path`. The execution times of the path keep the limits of the arm and of the safety filter.
 
     Args:
-        skill: skill whose goal is to be reached.
-        max_tilt: largest rotation of the tool away from the learned rotation, at the nearest place of the learned path
+        skill: skill whose goal the tool reaches.
+        max_tilt: largest rotation of the tool away from the learned rotation at the nearest point of the learned path
             [rad]; None: any rotation.
         seconds: limit of the computing time of the search [s].
         seed: seed of the search, at least 1.
@@ -221,8 +224,8 @@ class RRTConnect(PathPolicy):
         """Search for a clear joint path.
 
         Raises:
-            InfeasibleError: when the arm is not clear at the start, no posture at the goal is clear, no path was found
-                in time, or an obstacle moves.
+            InfeasibleError: when the start posture or every goal posture is too close to an obstacle, when no path was
+                found in time, or when an obstacle moves.
         """
         if any(obstacle.velocity.any() or obstacle.angular_velocity.any() for obstacle in scene.obstacles):
             raise InfeasibleError("rrt-connect plans only among obstacles that stand still: use another policy")
@@ -277,9 +280,8 @@ class RRTConnect(PathPolicy):
 class TiltLimitedRRTConnect(RRTConnect):
     """:class:`RRTConnect` with ACFRA's default of ``max_tilt``: two standard deviations of the demonstrations.
 
-    The standard deviation is taken at the nearest place of the learned path. If no orientation was learned, the default
-    requires an exact rotation of the tool, which a random search can't keep. Such a skill is therefore refused unless
-    ``max_tilt`` is given.
+    The standard deviation is the one at the nearest point of the learned path. If the skill has no learned orientation,
+    pass ``max_tilt``: the default is then 0, which a random search can't keep, and planning raises an error.
     """
 
     def _limits(self, components: ComponentPath) -> Array | None:

@@ -33,9 +33,9 @@ class MLP:
         """Return a network with normally distributed weights of variance ``1 / inputs``, and biases of 0.
 
         Args:
-            sizes: numbers of inputs, of units in each layer, and of outputs. The weights of the last layer are divided
-                by 10, so that the untrained network has small outputs.
-            rng: source of the random weights.
+            sizes: number of inputs, number of units in each layer, number of outputs. The weights of the last layer are
+                divided by 10, so that the outputs of the untrained network are small.
+            rng: random number generator for the weights.
         """
         weights = [rng.normal(size=pair) / np.sqrt(pair[0]) for pair in pairwise(sizes)]
         weights[-1] *= 0.1
@@ -52,10 +52,11 @@ class MLP:
 
         Args:
             x: inputs, shape (n, m).
-            slope: function from the outputs (n, k) to the derivatives of the loss with respect to them (n, k).
+            slope: function that gets the outputs (n, k) and returns the derivatives of the loss with respect to the
+                outputs, shape (n, k).
 
         Returns:
-            ``[dW_0, db_0, dW_1, db_1, ...]``, with the shapes of the parameters.
+            A list ``[dW_0, db_0, dW_1, db_1, ...]`` of arrays with the shapes of the parameters.
         """
         layers = [x]
         for W, b in zip(self.weights[:-1], self.biases[:-1], strict=True):
@@ -87,13 +88,13 @@ def train(
 
     Args:
         network: the network to start from; it is not changed.
-        gradient: function that takes a network and the indices of a batch (batch,). It returns the derivatives of the
-            loss, in the order of :meth:`MLP.gradient`.
+        gradient: function that gets a network and the indices of a batch's samples, shape (batch,). It returns the
+            derivatives of the loss, in the order of :meth:`MLP.gradient`.
         n_samples: number of samples from which the batches are drawn.
-        rng: source of the random batches.
+        rng: random number generator for the batches.
         steps: number of steps.
         batch: number of samples in a batch.
-        step_size: largest step size.
+        step_size: largest step size of Adam; the step size rises at first and then falls to 0.
     """
     parameters = [p.copy() for p in network.parameters]
     network = MLP(tuple(parameters[::2]), tuple(parameters[1::2]))

@@ -22,24 +22,26 @@ _TINY = 1e-12
 def modulated(desired: Array, around: NearObstacles, *, reactivity: float = 1.0, reach: float = 1.0) -> Array:
     r"""Return the modulated velocity.
 
-    For one obstacle with velocity ``v_o``, outward normal ``n`` and reference direction ``r`` (from the obstacle's
-    centre to the tool), the modulation changes the eigenvalues of the relative velocity::
+    Let ``v_o`` be the velocity of an obstacle, ``n`` its outward normal, and ``r`` the direction from its centre to the
+    tool. Let ``gap`` be the distance to the tool minus the required clearance, and ``size`` the sum of the obstacle's
+    radius, the tool's radius and the required clearance. The modulation multiplies the velocity relative to the
+    obstacle by a matrix M::
 
         v = M (u - v_o) + v_o,   M = E diag(1 - q, 1 + q, 1 + q) E^-1,   E = [r, e_1, e_2],   e_i . n = 0
         q = Gamma^(-1 / reactivity),   Gamma = (1 + gap / (reach size))^2
 
-    ``Gamma`` is 1 where the gap is 0, so that the tool does not move along the normal there. For a sphere, if ``reach``
-    and ``reactivity`` are 1, ``Gamma`` is the squared distance from the centre divided by the squared radius. In a
-    plane through the centre, the field is then the potential flow about a circle. If the tool is already too close,
-    ``q`` is above 1, and the modulation leads the tool out. A velocity away from the obstacle is not reduced.
+    Where the gap is 0, ``Gamma`` is 1, so the tool does not approach the obstacle there. For a sphere with ``reach =
+    reactivity = 1``, ``Gamma`` is the squared distance from the centre divided by the squared radius. The velocity
+    field is then the potential flow about a circle, in every plane through the centre. If the gap is negative, ``q`` is
+    above 1, and the modulation moves the tool away from the obstacle. A velocity away from the obstacle is not reduced.
 
-    For several obstacles, the norms and the directions of the velocities are averaged with the weights ``w_o =
-    prod_(i != o) (Gamma_i - 1)``, normalised to the sum 1. The mean direction is computed from the angles between each
-    direction and ``u``. If the tool is already too close to some obstacles, only these obstacles count. Their weights
-    are then ``1 - Gamma_o``, and their velocities are averaged as vectors.
+    For several obstacles, each obstacle o gives one velocity. The function averages the norms and the directions of
+    these velocities, with weights proportional to ``w_o = prod_(i != o) (Gamma_i - 1)``. It computes the mean direction
+    from the angles between each velocity and ``u``. If some gaps are negative, only the obstacles with negative gaps
+    count. Their velocities are then averaged as vectors, with weights proportional to ``1 - Gamma_o``.
 
     Args:
-        desired: u, shape (d,) [m/s].
+        desired: desired velocity u, shape (d,) [m/s].
         around: the obstacles.
         reactivity: with a larger value, an obstacle acts from farther away.
         reach: factor of the obstacles' sizes; with a larger value, an obstacle acts from farther away.

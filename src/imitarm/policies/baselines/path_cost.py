@@ -1,6 +1,6 @@
-r"""The cost of a path in the baseline ``gmm-irl``: features, their derivatives, and local minima.
+r"""The cost of a path in the baseline ``gmm-irl``, with its derivatives and the search for its local minima.
 
-A path is the nominal path ``x_i`` plus a deviation ``d_i``, at 100 equal time steps. The first and the last three
+A path is the nominal path ``x_i`` plus a deviation ``d_i``, at n = 100 equal time steps. The first and the last three
 deviations are 0. Let ``Sigma_i`` be the covariance of the demonstrations at sample ``i``, and ``g_oi`` the gap of this
 sample to obstacle ``o``. The cost is ``J = sum_k w_k phi_k`` with the following features ``phi_k``::
 
@@ -9,8 +9,8 @@ sample to obstacle ``o``. The cost is ``J = sum_k w_k phi_k`` with the following
     obstacles       mean_i sum_o exp(-max(g_oi, 0)^2 / (2 l^2))                  for l = 2, 5 and 10 cm
     contact         mean_i sum_o max(-g_oi, 0)^2 / (2 (1 cm)^2)
 
-The Hessian of ``J`` is a band matrix, because the third differences couple each sample with the next three, and
-obstacles do not couple samples.
+The Hessian of ``J`` is a band matrix: third differences couple each sample only with the next three, and the other
+features do not couple samples.
 """
 
 from __future__ import annotations
@@ -41,17 +41,17 @@ _free = slice(FIXED, -FIXED)
 
 @dataclass(frozen=True, eq=False)
 class PathCost:
-    """The features of paths in one scene. Deviations have shape (94, k) [m] and are expressed in k allowed directions.
+    """The cost of paths in one scene. A deviation has shape (94, k) [m]: 94 samples in k allowed directions.
 
     Attributes:
         nominal: nominal path at equal time steps, shape (100, 3) [m].
         covariances: covariances of the demonstrations at the samples, shape (100, 3, 3) [m^2].
         times: times of the samples since the motion began, shape (100,) [s].
-        gaps: distances to the obstacles; a moving obstacle is placed where it is at the time of each sample.
+        gaps: distances to the obstacles; a moving obstacle is at its predicted position at the time of each sample.
         margin: distance that is subtracted from each gap [m].
         axes: orthonormal basis of the allowed directions, as columns, shape (3, k).
-        one_sided: directions in which the path must not be displaced, in the basis ``axes``, shape (m, k); a
-            displacement in such a direction has the same cost as contact.
+        one_sided: directions in which the path should not be displaced, in the basis ``axes``, shape (m, k). A
+            displacement in such a direction costs as much as an equal overlap with an obstacle.
     """
 
     nominal: Array
@@ -74,18 +74,18 @@ class PathCost:
 
     @cached_property
     def precisions(self) -> Array:
-        """Inverse covariances in the allowed directions, shape (94, k, k) [1/m^2]."""
+        """Inverses of ``Sigma_i + (5 mm)^2 I`` in the allowed directions, shape (94, k, k) [1/m^2]."""
         inverse = np.linalg.inv(self.covariances[_free] + PRECISION**2 * np.eye(3))
         return np.asarray(self.axes.T @ inverse @ self.axes)
 
     @cached_property
     def smoothness(self) -> Array:
-        """Matrix of the feature "jerk" for one direction, shape (94, 94)."""
+        """Matrix A of the feature "jerk", which is ``d^T A d`` for a deviation d in one direction, shape (94, 94)."""
         third = np.diff(np.eye(N_SAMPLES), 3, axis=0)[:, _free]
         return np.asarray(float(N_SAMPLES - 1) ** 5 * third.T @ third)
 
     def features(self, deviation: Array) -> Array:
-        """Return the features phi, shape (6,)."""
+        """Return the six features ``phi_k`` of a deviation, shape (6,)."""
         gap = self._gaps(deviation)[0]
         quadratic = np.einsum("ij,ijk,ik->", deviation, self.precisions, deviation) / N_FREE
         jerk = np.sum(deviation * (self.smoothness @ deviation))
@@ -94,7 +94,7 @@ class PathCost:
         return np.array([quadratic, jerk, *near, deep / N_FREE])
 
     def gradients(self, deviation: Array) -> Array:
-        """Return the gradients of the features, shape (6, 94, k)."""
+        """Return the gradients of the six features with respect to the deviation, shape (6, 94, k)."""
         gap, normal = self._gaps(deviation)
         slopes = [bump(gap, r)[1] for r in RANGES]
         slopes.append(-depth(-gap)[1])
@@ -104,10 +104,10 @@ class PathCost:
         return np.stack([quadratic, 2.0 * self.smoothness @ deviation, *rows])
 
     def blocks(self, deviation: Array) -> Array:
-        """Return the second derivatives of the features with respect to the same sample, shape (6, 94, k, k).
+        """Return the second derivatives of the features with respect to each single sample, shape (6, 94, k, k).
 
-        The feature "jerk" couples different samples, so its entry here is 0; its Hessian is ``2 smoothness`` for each
-        direction.
+        The entries of the feature "jerk" are set to 0. Its Hessian also couples different samples; it is ``2
+        smoothness`` for each direction.
         """
         gap, normal = self._gaps(deviation)
         curvature = self._curvatures(deviation)
@@ -136,10 +136,10 @@ class PathCost:
         return 0.5 * (slope + np.swapaxes(slope, 2, 3))
 
     def hessian(self, weights: Array, blocks: Array) -> Array:
-        """Return the Hessian of J as an upper band, shape (3 k + 1, 94 k), for :func:`scipy.linalg.cholesky_banded`.
+        """Return the upper band of J's Hessian, shape (3 k + 1, 94 k), for :func:`scipy.linalg.cholesky_banded`.
 
         Args:
-            weights: w, shape (6,).
+            weights: weights w of the features, shape (6,).
             blocks: the result of :meth:`blocks`.
         """
         within = np.tensordot(weights, blocks, axes=1)
@@ -154,11 +154,11 @@ class PathCost:
         return band
 
     def minimised(self, weights: Array, start: Array) -> Array:
-        """Return the local minimum of J that L-BFGS reaches from a deviation (94, k).
+        """Return the local minimum of J that L-BFGS reaches from a start deviation, both of shape (94, k) [m].
 
-        The optimiser works with ``y = U d`` instead of the deviation d, where U is the Cholesky factor of the Hessian
-        of the two quadratic features. The cost of these features is then ``|y|^2 / 2``, so L-BFGS converges in few
-        iterations.
+        Let U be the Cholesky factor of the Hessian of the two quadratic features, deviation and jerk. The optimiser
+        uses ``y = U d`` instead of the deviation d. The cost of these two features is then ``|y|^2 / 2``, so L-BFGS
+        converges in few iterations.
         """
         quadratic = np.zeros_like(weights)
         quadratic[:2] = weights[:2]
@@ -191,7 +191,7 @@ class PathCost:
 
 
 def bump(gap: Array, reach: float) -> tuple[Array, Array, Array]:
-    """Return ``exp(-max(g, 0)^2 / (2 l^2))`` and its first two derivatives with respect to g."""
+    """Return ``exp(-max(g, 0)^2 / (2 l^2))`` for the gaps g and ``l = reach``, and its first two derivatives."""
     u = np.maximum(gap, 0.0) / reach
     value = np.exp(-0.5 * u * u)
     outside = gap > 0.0
@@ -199,6 +199,6 @@ def bump(gap: Array, reach: float) -> tuple[Array, Array, Array]:
 
 
 def depth(depth: Array) -> tuple[Array, Array, Array]:
-    """Return ``max(m, 0)^2 / (2 (1 cm)^2)`` and its first two derivatives with respect to m."""
+    """Return ``max(m, 0)^2 / (2 (1 cm)^2)`` for the depths m [m], and its first two derivatives."""
     m = np.maximum(depth, 0.0) / _DEPTH_SCALE
     return 0.5 * m * m, m / _DEPTH_SCALE, np.where(depth > 0.0, 1.0, 0.0) / _DEPTH_SCALE**2

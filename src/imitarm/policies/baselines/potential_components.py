@@ -1,19 +1,19 @@
-r"""ACFRA as printed in the thesis: push the components' means by a repulsive potential (thesis Eqs 4.2-4.8).
+r"""The thesis's ACFRA: a repulsive potential pushes the means of the components (thesis Eqs 4.2-4.8).
 
-The module uses the same gradient descent for two potentials. Let ``d`` be the distance from an obstacle to the
-component's ellipse, ``n`` the outward normal and ``sigma(n) = sqrt(n^T Sigma n)`` the component's spread towards the
-obstacle.
+Gradient descent moves the means in one of two potentials. Let ``d`` be the distance from an obstacle to the ellipse of
+a component, and ``n`` the outward normal. The component's spread towards the obstacle is ``sigma(n) = sqrt(n^T Sigma
+n)``.
 
 * ``literal``: Eq 4.7 as printed, ``U = 1/2 k (1/d - 1/d_th)^2 - exp(sigma^2)``. The term ``exp(sigma^2)`` does not
-  depend on the position, so the force does not contain the term, and the spread has no effect.
-* ``mapf``: a dimensionless potential with the effect that the thesis describes in words:
-  ``U = 1/2 eta s d_th^2 (1/rho - 1)^2`` with ``rho = d / d_th``. The gain ``s = exp((sigma(n)^2 - median) / max)``
-  pushes components with a large spread farther than components with a small spread. Here, ``median`` and ``max`` are
-  the median and the maximum of ``sigma(n)^2`` over the components.
+  depend on the position of the mean. The spread therefore has no effect on the force.
+* ``mapf``: a modified potential with the effect that the thesis describes in words: ``U = 1/2 eta s d_th^2 (1/rho -
+  1)^2`` with ``rho = d / d_th``. The gain ``s = exp((sigma(n)^2 - median) / max)`` pushes components with a large
+  spread farther than components with a small spread. Here, ``median`` and ``max`` are the median and the maximum of
+  ``sigma(n)^2`` over the components.
 
-Neither potential checks whether the path *between* two pushed means is clear. Two components on opposite sides of an
-obstacle are pushed apart, so the path between them passes through the obstacle. Both potentials are kept for
-comparison; ``certified`` is the default method.
+The potentials act only on the means, not on the path between two means. If two successive means are pushed to opposite
+sides of an obstacle, the path between them passes through the obstacle. The potentials serve for comparison;
+``certified`` is the default method.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ _GAIN_RANGE = (0.25, 4.0)
 def component_distances(
     path: ComponentPath, displacement: Array, obstacles: Sequence[Obstacle], margin: float
 ) -> tuple[Array, Array, Array]:
-    """Return the distances of the components' one-sigma ellipses from the inflated obstacles.
+    """Return the distances from the obstacles, enlarged by ``margin``, to the one-sigma ellipses of the components.
 
-    The distance is ``d = sd(mu) - sqrt(n^T Sigma n) - margin``: the signed distance of the ellipse's centre ``mu``,
-    minus the ellipse's extent towards the obstacle, minus the margin. The result is exact for spheres, and a lower
-    bound for every convex obstacle that does not contain the centre.
+    The distance is ``d = sd(mu) - sqrt(n^T Sigma n) - margin``. Here, ``sd(mu)`` is the signed distance of the
+    ellipse's centre ``mu``, and the square root is the extent of the ellipse towards the obstacle. The result is exact
+    for a spherical obstacle. It is a lower bound for every convex obstacle that does not contain the centre.
 
     Returns:
         distances (n_obstacles, n_components) [m], normals (n_obstacles, n_components, 3) and spreads
@@ -61,7 +61,7 @@ def literal_force(distance: Array, normal: Array, spread: Array) -> Array:
     Args:
         distance: distance from each ellipse to each obstacle, (n_obstacles, n_components) [m].
         normal: outward normals, (n_obstacles, n_components, 3).
-        spread: not used, because ``exp(sigma^2)`` does not depend on the position, so its gradient is zero.
+        spread: not used (see the text of this module).
     """
     del spread
     d = np.clip(distance, _RHO_MIN * INFLUENCE_DISTANCE, INFLUENCE_DISTANCE)
@@ -74,8 +74,7 @@ def modified_force(distance: Array, normal: Array, spread: Array) -> Array:
     Args:
         distance: distance from each ellipse to each obstacle, (n_obstacles, n_components) [m].
         normal: outward normals, (n_obstacles, n_components, 3).
-        spread: sigma(n), (n_obstacles, n_components) [m]; the gain uses the median and the maximum of the squared
-            spreads.
+        spread: sigma(n), (n_obstacles, n_components) [m].
     """
     variance = spread**2
     gain = np.clip(np.exp((variance - np.median(variance)) / variance.max()), *_GAIN_RANGE)
@@ -89,14 +88,14 @@ FORCES = {"literal": literal_force, "mapf": modified_force}
 def push_components(
     path: ComponentPath, obstacles: Sequence[Obstacle], margin: float, *, method: str, forbidden: Array
 ) -> Array:
-    """Move the means along the potential's force until the force on every mean is zero, for at most 200 steps.
+    """Move the means along the forces until all forces are zero, but for at most 200 steps.
 
     Args:
         path: the nominal path and its components.
         obstacles: obstacles with signed distance and gradient.
-        margin: radius of the tool plus required clearance [m].
+        margin: radius of the tool's sphere plus the required clearance [m].
         method: ``"literal"`` or ``"mapf"``.
-        forbidden: directions in which no mean may move, unit rows (m, 3).
+        forbidden: directions in which no mean may move, unit vectors, shape (m, 3).
 
     Returns:
         The displacement of each mean, shape (n_components, 3) [m].
@@ -114,14 +113,13 @@ def push_components(
 
 
 class PotentialField(PathAdapter):
-    """The thesis's method: push components away from obstacles.
+    """The thesis's method: push the components of the path away from obstacles.
 
-    The resulting path is evaluated by the same certificate as a path of the method ``certified``. The tool is
-    represented by one sphere about its tip that contains all spheres of the tool. Obstacles are assumed to stay at
-    their poses at time 0.
+    The clearance of the resulting path is computed as for the method ``certified``. While the components are pushed,
+    one sphere about the tip represents the tool, and the obstacles stay at their poses at time 0.
 
     Args:
-        force: a name in ``FORCES``.
+        force: name of the force, ``"literal"`` or ``"mapf"``.
     """
 
     def __init__(self, force: str) -> None:

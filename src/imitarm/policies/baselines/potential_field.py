@@ -7,9 +7,9 @@ of an obstacle, and ``n`` the gradient of d. Each force F is the negative gradie
     U_a = eta rho_c (rho - rho_c / 2)           F_a = -eta rho_c (x - g) / rho             otherwise
     U_r = 1/2 k (1/d - 1/d_0)^2                 F_r = k (1/d - 1/d_0) d^-2 n               if d <= d_0, else 0
 
-The cap ``rho_c`` limits the attraction far from the goal. The repulsion grows without bound at the surface of an
-obstacle. At distances below the floor ``d_f``, the force therefore keeps its value at ``d_f``. The potential continues
-there as a straight line, so the force is the negative gradient of the potential everywhere, even inside an obstacle.
+The distance ``rho_c`` limits the attraction far from the goal. The factor of the repulsion grows without bound at the
+surface of an obstacle. For all d below ``d_f`` = 5 mm, this implementation therefore uses the force at ``d_f``. There,
+the potential is a linear function of d, so the force is its negative gradient everywhere, even inside an obstacle.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ DISTANCE_FLOOR = 0.005  # [m] d_f: below this distance the repulsion is constant
 
 
 def attractive_potential(position: Array, goal: Array, stiffness: float, cap: float) -> float:
-    """Return U_a (Eq 2.15, with a cap).
+    """Return the attractive potential U_a (Eq 2.15, with the limit ``rho_c``).
 
     Args:
         position: x, shape (3,) [m].
@@ -36,9 +36,9 @@ def attractive_potential(position: Array, goal: Array, stiffness: float, cap: fl
 
 
 def attractive_force(position: Array, goal: Array, stiffness: float, cap: float) -> Array:
-    """Return F_a, shape (3,) (Eq 2.17, as a vector towards the goal and with a cap).
+    """Return the attractive force F_a towards the goal, shape (3,) (Eq 2.17, with the limit ``rho_c``).
 
-    The arguments are those of :func:`attractive_potential`.
+    The arguments have the same meaning as in :func:`attractive_potential`.
     """
     away = position - goal
     rho = float(np.linalg.norm(away))
@@ -46,7 +46,7 @@ def attractive_force(position: Array, goal: Array, stiffness: float, cap: float)
 
 
 def repulsive_potential(distance: Array, gain: float, influence: float) -> float:
-    """Return the sum of U_r over the obstacles (Eqs 2.18 and 2.21).
+    """Return the sum of the repulsive potentials U_r of all obstacles (Eqs 2.18 and 2.21).
 
     Args:
         distance: d, distance to the closest point of each obstacle, negative inside, shape (n,) [m].
@@ -60,7 +60,7 @@ def repulsive_potential(distance: Array, gain: float, influence: float) -> float
 
 
 def repulsive_force(distance: Array, normal: Array, gain: float, influence: float) -> Array:
-    """Return the sum of F_r over the obstacles, shape (3,) (Eqs 2.19 and 2.22).
+    """Return the sum of the repulsive forces F_r of all obstacles, shape (3,) (Eqs 2.19 and 2.22).
 
     Args:
         distance: d, shape (n,) [m].

@@ -1,4 +1,4 @@
-"""How a baseline moves when the scene changes: one control period at a time, with the last observed obstacles."""
+"""Reaction: the motion of a baseline in a changing scene, one control period at a time."""
 
 from __future__ import annotations
 
@@ -17,20 +17,19 @@ _SAME = 1e-9  # [m] an obstacle that has moved by less stands where it stood
 
 
 class Reaction(ABC):
-    """The motion of a method in a scene whose obstacles move, appear or disappear.
+    """The motion of a baseline in a scene whose obstacles move, appear or disappear.
 
-    A baseline plans its path once if the obstacles stand still. If an obstacle moves, appears or disappears, the
-    baseline instead integrates the same equations step by step, with the current positions and velocities of the
-    obstacles.
+    A baseline plans its path once if the obstacles stand still. In a changing scene, the baseline integrates the same
+    equations step by step, with the last observed positions and velocities of the obstacles.
 
     Args:
         nominal: the learned path between the start and the goal of this motion.
         position: measured position of the tool, shape (3,) [m].
         velocity: velocity of the tool, shape (3,) [m/s].
-        fraction: fraction of the duration that has passed.
+        fraction: elapsed time divided by the duration.
 
     Attributes:
-        fraction: fraction of the duration that has passed; above 1 after the learned duration.
+        fraction: elapsed time divided by the duration; it may exceed 1.
         position: desired position of the tool, shape (3,) [m].
     """
 
@@ -44,13 +43,13 @@ class Reaction(ABC):
         return self.nominal.positions[-1]
 
     def learned(self, fraction: float) -> Array:
-        """Return the position on the learned path, shape (3,) [m]."""
+        """Return the position on the learned path at a fraction of the duration, shape (3,) [m]."""
         phase = min(max(fraction, 0.0), 1.0)
         found: Array = self.nominal.at([self.nominal.times[0] + phase * self.nominal.duration])[0][0]
         return found
 
     def advance(self, scene: Scene, dt: float) -> Array:
-        """Return the velocity of the tool for the next ``dt`` seconds, shape (3,) [m/s], and move ``position`` by it.
+        """Advance by ``dt`` seconds; return the velocity of the tool in this time, shape (3,) [m/s].
 
         Args:
             scene: the obstacles at the current time.
@@ -63,11 +62,11 @@ class Reaction(ABC):
 
     @abstractmethod
     def step(self, scene: Scene, dt: float) -> None:
-        """Move ``position`` and ``fraction`` by one control period."""
+        """Change ``position`` and ``fraction`` to their values one control period later."""
 
 
 def changed(before: PackedObstacles, now: PackedObstacles) -> bool:
-    """Return whether an obstacle moves, or differs in position from before, or the number of obstacles differs."""
+    """Return whether an obstacle moves or has another position, or the number of obstacles has changed."""
     if not now.still or len(before) != len(now):
         return True
     return bool(np.abs(before.positions - now.positions).max(initial=0.0) > _SAME)

@@ -1,4 +1,4 @@
-"""Stop-only: speed and separation monitoring, which stops the arm where other methods go around an obstacle."""
+"""Stop-only: speed and separation monitoring, which stops the tool in front of an obstacle and never avoids it."""
 
 from __future__ import annotations
 
@@ -25,28 +25,30 @@ _STANDS = 0.02  # rate of the phase below which the arm is said to wait
 
 
 class StopOnly(Policy):
-    r"""Follow the learned path, and stop while an obstacle is nearer than the protective separation distance.
+    r"""Follow the learned path, and stop while an obstacle is too near.
 
-    The distance of speed and separation monitoring (ISO/TS 15066) is
+    An obstacle is too near if its distance is less than the required clearance plus the protective separation distance
+    of speed and separation monitoring (ISO/TS 15066):
 
     .. math:: S = v_h (T_r + T_s) + v_r T_r + S_s + C + Z_d + Z_r
 
-    Here, :math:`v_h` is the tracked speed of the obstacle along the line to the tool, at least 0, and :math:`v_r` is
-    the speed of the tool on the learned path. :math:`T_r` is the reaction time. With the deceleration a, the tool has
-    the stopping time :math:`T_s = v_r / a` and the stopping distance :math:`S_s = v_r^2 / (2 a)`. C is the intrusion
-    distance. :math:`Z_d` is the uncertainty of the obstacle's position: two standard deviations of the tracked position
-    along the line. :math:`Z_r` is the uncertainty of the tool's position. When the tool stops or starts again, its
-    progress along the path changes with the deceleration or acceleration a.
+    Here, :math:`v_h` is the speed at which the tracked obstacle approaches the tool, or 0 if the obstacle moves away.
+    :math:`v_r` is the speed of the tool on the learned path, and :math:`T_r` is the reaction time. With the
+    deceleration a, the tool has the stopping time :math:`T_s = v_r / a` and the stopping distance :math:`S_s = v_r^2 /
+    (2 a)`. C is the intrusion distance: how far an obstacle may enter the monitored zone before a sensor detects it.
+    :math:`Z_d` is the uncertainty of the obstacle's position: two standard deviations in the direction to the tool.
+    :math:`Z_r` is the uncertainty of the tool's position. The tool brakes and accelerates along the path with the
+    acceleration a.
 
-    **Known failure.** The tool never leaves the path. An obstacle that moves towards the standing tool hits the tool.
-    An obstacle that stays near the path stops the motion for ever.
+    **Known failure.** The tool never leaves the path. If an obstacle moves towards the stopped tool, it hits the tool.
+    If an obstacle stays near the path, the motion never continues.
 
     Args:
         skill: skill to reproduce.
-        reaction: T_r [s].
-        deceleration: a [m/s^2].
-        intrusion: C [m].
-        tool_uncertainty: Z_r [m].
+        reaction: reaction time T_r [s].
+        deceleration: deceleration and acceleration a [m/s^2].
+        intrusion: intrusion distance C [m].
+        tool_uncertainty: uncertainty Z_r of the tool's position [m].
         options: arguments of :class:`~imitarm.policies.Policy`.
     """
 
@@ -70,7 +72,7 @@ class StopOnly(Policy):
         self._phase: float | None = None
 
     def reset(self, observation: Observation) -> None:
-        """Start at the beginning of the learned path."""
+        """Begin the motion at the start of the learned path."""
         away = observation.tool_to_base.error_to(self.skill.start_)[:3]
         start = None if np.linalg.norm(away) <= _ARRIVED else observation.tool_to_base
         times = np.linspace(0.0, self.skill.duration_, _SAMPLES)
@@ -119,9 +121,9 @@ class StopOnly(Policy):
         """Return the protective separation distance S of each obstacle, shape (n,) [m].
 
         Args:
-            approach: v_h, shape (n,) [m/s].
-            speed: v_r [m/s].
-            uncertainty: Z_d, shape (n,) [m].
+            approach: speed v_h of each obstacle towards the tool, shape (n,) [m/s].
+            speed: speed v_r of the tool [m/s].
+            uncertainty: uncertainty Z_d of each obstacle's position, shape (n,) [m].
         """
         stopping = speed / self.deceleration
         own = speed * self.reaction + 0.5 * speed * stopping

@@ -1,4 +1,4 @@
-"""TP-GMM: a mixture that is learned relative to the start and to the goal (Calinon 2016), repelled by obstacles."""
+"""TP-GMM: a path that is learned relative to the start and the goal (Calinon 2016), with repulsion from obstacles."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ _SAMPLES = 200  # of each demonstration
 
 
 class FrameMixture(NamedTuple):
-    r"""A Gaussian mixture that is known in two frames, at the start and at the goal of a motion.
+    r"""A Gaussian mixture in two frames: one at the start and one at the goal of a motion.
 
     Frame 1 describes a motion by ``z_1 = [t; x - start]``, and frame 2 by ``z_2 = [t; x - goal]``. In frame j,
     component k is the Gaussian ``N(mu_k^j, Sigma_k^j)``. For a new start and goal, each component is the product of its
-    two Gaussians, moved to the base frame::
+    two Gaussians, both transformed to the base frame::
 
         Sigma_k^-1 = sum_j (Sigma_k^j)^-1,     mu_k = Sigma_k sum_j (Sigma_k^j)^-1 (mu_k^j + [0; b_j])
 
-    Here, ``b_1`` is the start and ``b_2`` is the goal. The frame in which the demonstrations agree better therefore has
+    Here, ``b_1`` is the start and ``b_2`` is the goal. The frame in which the demonstrations vary less therefore has
     more influence.
 
     Attributes:
-        weights: shape (K,).
-        means: mu, shape (2, K, 4) [s, m].
-        covariances: Sigma, shape (2, K, 4, 4).
+        weights: weight of each of the K components, shape (K,).
+        means: means mu of the components in both frames, shape (2, K, 4) [s, m].
+        covariances: covariances Sigma of the components in both frames, shape (2, K, 4, 4).
         duration: duration of the motion [s].
     """
 
@@ -53,7 +53,7 @@ class FrameMixture(NamedTuple):
 
     @classmethod
     def of(cls, demonstrations: Sequence[Trajectory], n_components: int) -> FrameMixture:
-        """Fit the mixture to ``[t; x - start; x - goal]`` of demonstrations of equal duration."""
+        """Fit the mixture to the samples ``[t; x - start; x - goal]`` of demonstrations, all with the same duration."""
         times = np.linspace(0.0, 1.0, _SAMPLES)
         duration = demonstrations[0].duration
         paths = [d.at(d.times[0] + times * d.duration)[0] for d in demonstrations]
@@ -67,7 +67,7 @@ class FrameMixture(NamedTuple):
         return cls(fitted.weights_, np.stack(means), np.stack(covariances), duration)
 
     def between(self, start: Array, goal: Array) -> GMR:
-        """Return the regression for a start and a goal, positions of shape (3,) [m]."""
+        """Return the Gaussian mixture regression for the positions of a start and a goal, each of shape (3,) [m]."""
         moved = self.means.copy()
         moved[0, :, 1:] += start
         moved[1, :, 1:] += goal
@@ -80,11 +80,11 @@ class FrameMixture(NamedTuple):
 
 
 def demonstrations_between_ends(skill: Skill, spread: float) -> list[Trajectory]:
-    """Return demonstrations with different starts and goals, made from a skill.
+    """Return simulated demonstrations of a skill, with different starts and goals.
 
-    The start or the goal is displaced by ``spread`` [m] in both directions along each axis, which changes the skill's
-    nominal path. Each of the seven paths of :func:`~imitarm.policies.baselines.gmm_dmp.reconstructed_demonstrations` is
-    then changed in the same way.
+    For each demonstration, the start or the goal is displaced by ``spread`` [m] along one axis, in the positive or the
+    negative direction. The skill adapts its nominal path to the new ends. The same change is then added to each of the
+    seven paths of :func:`~imitarm.policies.baselines.gmm_dmp.reconstructed_demonstrations`.
     """
     times = np.linspace(0.0, skill.duration_, _SAMPLES)
     learned = skill.nominal(times).positions
@@ -101,23 +101,23 @@ def demonstrations_between_ends(skill: Skill, spread: float) -> list[Trajectory]
 class TPGMM(CoupledMotion):
     r"""TP-GMM: a path that is learned relative to the start and to the goal (Calinon 2016).
 
-    A :class:`FrameMixture` gives the path ``x(t)`` between the start and the goal of a motion by Gaussian mixture
-    regression. The skill's spring follows this path; obstacles repel it::
+    Gaussian mixture regression with a :class:`FrameMixture` gives the path ``x(t)`` between the start and the goal of a
+    motion. A spring with the gains K and D of the skill pulls the tool along this path, and obstacles repel the tool::
 
         T^2 x'' = K (y(t) - x) - D T x' + Phi,     Phi = sum k (1/d - 1/d_0) d^-2 n     (thesis Eq 2.19)
 
-    Here, ``y`` is the attractor of a primitive that is fitted to ``x(t)``. The published method avoids an obstacle only
-    if the obstacle was a frame in the demonstrations. The demonstrations of a skill contain no obstacle, so the
-    repulsion ``Phi`` is used instead. With ``force=0``, the method does not avoid obstacles.
+    Here, ``y`` is the target of a motion primitive that is fitted to ``x(t)``. In the paper, the frames can include
+    obstacles, if the demonstrations contain them. The demonstrations of a skill contain no obstacle, so this class adds
+    the repulsion ``Phi`` instead. With ``force=0``, the policy does not avoid obstacles.
 
     Args:
         skill: skill to reproduce.
         demonstrations: demonstrations with different starts and goals; None: :func:`demonstrations_between_ends`,
             because a skill does not keep its demonstrations.
-        spread: displacement of the starts and goals in :func:`demonstrations_between_ends` [m].
-        force: k [m^4].
-        influence: d_0 [m].
-        n_components: number of Gaussians; None: the skill's number.
+        spread: displacement of the start or the goal in :func:`demonstrations_between_ends` [m].
+        force: k, the factor of the repulsion [m^4].
+        influence: d_0, the gap below which an obstacle repels [m].
+        n_components: number of Gaussians; None: the same number as in the skill.
         options: arguments of :class:`~imitarm.policies.baselines.coupled_motion.CoupledMotion`.
     """
 
@@ -149,12 +149,12 @@ class TPGMM(CoupledMotion):
         self.mixture_ = FrameMixture.of(shown, number)
 
     def target(self, nominal: Trajectory, fractions: Array) -> Array:
-        """Return the attractor of the path between the start and the goal of this motion, shape (n, 3) [m]."""
+        """Return the target of the spring for the start and the goal of this motion, shape (n, 3) [m]."""
         regression = self.mixture_.between(nominal.positions[0], nominal.positions[-1])
         path = regression.trajectory(_SAMPLES)
         primitive = DMP(self.skill.dmp_.gains_, n_basis=self.skill.dmp_.n_basis).fit(path, exact_ends=True)
         return primitive.begin().target.at(np.exp(-DECAY * fractions))
 
     def term(self, state: MotionState) -> Array:
-        """Return the repulsion, shape (3,) [m]."""
+        """Return the repulsion ``Phi``, shape (3,) [m]."""
         return repulsive_force(state.distance, state.normal, self.force, self.influence)

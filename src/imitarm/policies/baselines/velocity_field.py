@@ -28,15 +28,17 @@ _LARGEST_SIZE = 0.3  # [m] of an obstacle without bounds, such as a table
 
 
 class NearObstacles(NamedTuple):
-    """Distances and directions from the obstacles to the tool, in the d directions in which it may be displaced.
+    """Distances and directions from the obstacles to the tool, expressed in the d directions that are not forbidden.
 
     Attributes:
         gap: distance of the tool to each obstacle, minus the required clearance, shape (n,) [m].
-        normal: outward normals, shape (n, d); shorter than 1 if part of a normal lies in a forbidden direction.
+        normal: outward normals, projected on the d directions, shape (n, d).
         velocity: velocity of each obstacle at its closest point, shape (n, d) [m/s].
-        drift: the part of the tool's velocity in forbidden directions, projected on each normal, shape (n,) [m/s].
-        outward: vectors from the centres of the obstacles to the tool, shape (n, d) [m]; for a half-space, its normal.
-        size: radius of a sphere that contains the obstacle, plus the tool's radius and the clearance, shape (n,) [m].
+        drift: component along each normal of the tool's velocity in the directions that the method does not change,
+            shape (n,) [m/s].
+        outward: vector from the centre of each obstacle to the tool, or the normal of a half-space, shape (n, d) [m].
+        size: radius of a sphere that contains the obstacle, plus the radius of the tool, plus the clearance, shape (n,)
+            [m].
     """
 
     gap: Array
@@ -67,22 +69,23 @@ _Around = tuple[ToolGaps, PackedObstacles, float]
 
 
 class VelocityField(BaselinePolicy):
-    r"""Let the tool follow a point that moves along the learned path; near obstacles, the tool's velocity is changed.
+    r"""Base class: the tool follows a point that moves along the learned path; near obstacles, its velocity changes.
 
-    The desired velocity ``u`` of the tool at ``x`` follows the point ``x_0(s)`` of the learned path, with the phase
-    ``s`` [s]. If the tool lags behind, the point slows down to a rate r below 1::
+    The point is at ``x_0(s)`` on the learned path, where the phase ``s`` [s] is a time. The tool at ``x`` has the
+    desired velocity ``u``. If the tool lags behind the point, the rate ``r`` of the phase is below 1, so the point
+    waits::
 
         u = r dx_0/ds + k (x_0(s) - x),     ds/dt = r = 1 / (1 + |x_0(s) - x| / e_0)
 
     The norm of ``u`` is limited to 1.5 times the highest speed of the learned path. A subclass implements
     :meth:`velocity`, which changes ``u`` near obstacles, and the tool moves with ``dx/dt = velocity(u)``. The motion
-    ends at the goal. If the tool is not within 5 mm of the goal after twice the learned duration, the method refuses
+    ends at the goal. If the tool is more than 5 mm from the goal after twice the learned duration, the method refuses
     the scene.
 
     Args:
         skill: skill to reproduce.
-        pull: k, stiffness of the path [1/s].
-        slack: e_0, the distance between tool and point at which the point moves at half of its learned speed [m].
+        pull: k, gain with which the tool is pulled to the point [1/s].
+        slack: e_0, distance between tool and point at which the rate is one half [m].
         options: arguments of :class:`~imitarm.policies.baselines.baseline_policy.BaselinePolicy`.
     """
 
@@ -103,8 +106,8 @@ class VelocityField(BaselinePolicy):
         Args:
             desired: desired velocity in the allowed directions, shape (d,) [m/s].
             around: the obstacles.
-            limits: largest velocity in each direction ``self.one_sided``, shape (m,) [m/s]. If the result exceeds a
-                limit, it is reduced to the limit.
+            limits: largest velocity in each direction ``self.one_sided``, shape (m,) [m/s]. The caller reduces a result
+                that exceeds a limit.
         """
 
     def tool_path(self, nominal: Trajectory, gaps: ToolGaps, scene: Scene) -> tuple[Array, Array]:
@@ -138,9 +141,10 @@ class VelocityField(BaselinePolicy):
 
         Args:
             x: position before, shape (3,) [m].
-            phase: index of the point on the learned path, as a float.
-            follow: the learned path, the rate of its phase, the length of the step [s], and the largest speed [m/s].
-            around: the gaps, the obstacles, and the time for which they have moved from their poses in the scene [s].
+            phase: index of the point among the samples of the learned path, not rounded.
+            follow: the learned path, the length of the step in samples of the path and in seconds, and the largest
+                speed [m/s].
+            around: the gaps, the obstacles, and the time since the stamp of the scene [s].
         """
         learned, ratio, dt, fastest = follow
         target = _at(phase, learned)
@@ -160,7 +164,7 @@ class VelocityField(BaselinePolicy):
         return x + dt * (fixed + self.axes @ v), ahead
 
     def reaction(self, nominal: Trajectory, position: Array, velocity: Array, fraction: float) -> Reaction:
-        """Return the motion in the velocity field, one control period at a time."""
+        """Return a motion in the velocity field that advances by one control period at a time."""
         return _FieldReaction(self, nominal, position, velocity, fraction)
 
     def _obstacles(self, x: Array, time: float, fixed: Array, gaps: ToolGaps, packed: PackedObstacles) -> NearObstacles:
