@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from compiled_code import by_numpy
+from imitarm.kinematics.arm import ArmModel
+from imitarm.kinematics.pose import Pose
 from imitarm.perception import Detection, ObstacleTracker
-from imitarm.perception.motion_filter import MotionFilter, updated
-from imitarm.scene import Sphere
+from imitarm.perception.motion_filter import MotionFilter
+from imitarm.perception.track_memory import TrackMemory, updated
+from imitarm.perception.tracks import UNCONFIRMED
+from imitarm.scene import Box, ConvexHull, Sphere
+from imitarm.scene.clearance_limit import ClearanceLimit
+
+ARM = ArmModel.load("sawyer", tool="gripper")
 
 pytestmark = pytest.mark.usefixtures("compiled")
 
@@ -30,7 +41,7 @@ def test_both_ways_track_alike(monkeypatch, seed, motion):
             [Detection(Sphere(positions[i], 0.02), noise, label) for i, label in zip(seen, labels, strict=True)]
         )
     calls, trackers = [], []
-    for kernel in (lambda *_: None, lambda *given: calls.append(updated(*given)) or calls[-1]):
+    for kernel in (lambda *_, **__: None, lambda *given, **more: calls.append(updated(*given, **more)) or calls[-1]):
         monkeypatch.setattr("imitarm.perception.tracker.updated", kernel)
         trackers.append(ObstacleTracker(motion, max_speed=0.5))
         for k, frame in enumerate(frames):
@@ -45,6 +56,14 @@ def test_both_ways_track_alike(monkeypatch, seed, motion):
     assert any(call is not None for call in calls)
 
 
+def memory_of(belief) -> TrackMemory:
+    """Return confirmed tracks with these beliefs."""
+    n = len(belief.mean)
+    whole = {name: np.ones(n, dtype=np.int64) for name in ("hits", "ages", "counts", "ids")}
+    columns = {"sizes": np.ones((n, 3)), "last_seen": np.zeros(n), **whole}
+    return TrackMemory.of(belief.mean, belief.covariance, np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)), columns)
+
+
 @pytest.mark.parametrize("motion", ["constant-velocity", "constant-acceleration"])
 def test_without_detections_the_kernel_predicts(motion):
     rng = np.random.default_rng(0)
@@ -52,17 +71,92 @@ def test_without_detections_the_kernel_predicts(motion):
     belief = motion_filter.born(rng.normal(size=(4, 3)), 1e-4 * np.eye(3)[None].repeat(4, 0))
     belief.mean[...] = rng.normal(size=belief.mean.shape)
     expected = motion_filter.predict(belief, 0.07)
-    first = np.ones(4, dtype=bool)
-    x, P, detections, _ = updated(belief.mean, belief.covariance, first, 0.07, 0.3, np.zeros((0, 15)), 11.0, 1e9)
-    np.testing.assert_allclose(x, expected.mean, rtol=1e-12)
-    np.testing.assert_allclose(P, expected.covariance, rtol=1e-12, atol=1e-18)
-    assert (detections == -1).all()
+    memory, flags = updated(memory_of(belief), 0.07, 0.07, b"", 0.3, 11.0, 1e9, window=3)
+    np.testing.assert_allclose(memory.array("mean"), expected.mean, rtol=1e-12)
+    np.testing.assert_allclose(memory.array("covariance"), expected.covariance, rtol=1e-12, atol=1e-18)
+    assert (memory.array("detected") == -1).all() and flags == 0
 
 
 def test_a_doubtful_assignment_is_left_to_numpy():
     motion_filter = MotionFilter("constant-velocity", 0.05, 0.5)
-    belief = motion_filter.born(np.zeros((1, 3)), 1e-4 * np.eye(3)[None])
-    rows = np.array([Detection(Sphere([x, 0.0, 0.0], 0.01), 1e-6 * np.eye(3)).row for x in (0.01, -0.01)])
-    arguments = (belief.mean, belief.covariance, np.ones(1, dtype=bool), 0.1, 0.05)
-    assert updated(*arguments, rows, 11.0, 3.0) is None
-    assert updated(*arguments, rows[:1], 11.0, 3.0) is not None
+    memory = memory_of(motion_filter.born(np.zeros((1, 3)), 1e-4 * np.eye(3)[None]))
+    rows = [Detection(Sphere([x, 0.0, 0.0], 0.01), 1e-6 * np.eye(3)).row_bytes for x in (0.01, -0.01)]
+    numbers = 0.05, 11.0, 3.0
+    assert updated(memory, 0.1, 0.1, b"".join(rows), *numbers, window=3) is None
+    assert updated(memory, 0.1, 0.1, rows[0], *numbers, window=3) is not None
+
+
+def frames_of(rng: np.random.Generator, n_frames: int = 12) -> list[list[Detection]]:
+    """Return detections of a box, a sphere and a hull; their sizes, rotations and order vary."""
+    corners, frames = rng.uniform(-0.05, 0.05, (8, 3)), []
+    for k in range(n_frames):
+        turn = np.array([np.cos(0.02 * k), 0.0, 0.0, np.sin(0.02 * k)])
+        shapes = [
+            Box(Pose([0.5, 0.01 * k, 0.2], turn), rng.uniform(0.09, 0.11, 3), name="tin"),
+            Sphere([0.0, -0.5, 0.01 * k], rng.uniform(0.04, 0.05)),
+            ConvexHull(corners + [-0.5, 0.01 * k, 0.0]),
+        ]
+        shapes = shapes[: 2 if k < n_frames // 2 else 3]
+        frames.append(
+            [
+                Detection(shapes[i], 1e-5 * np.eye(3), "ball" if i == 1 else "")
+                for i in rng.permutation(len(shapes)).tolist()
+            ]
+        )
+    return frames
+
+
+@settings(deadline=None, max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**32 - 1), rotations=st.booleans(), delay=st.sampled_from([-0.02, 0.0, 0.05]))
+def test_both_ways_report_the_same_obstacles(seed, rotations, delay):
+    """Scenes and tracks agree: poses, sizes, names, velocities, covariances and times."""
+    frames = frames_of(np.random.default_rng(seed))
+
+    def last() -> tuple:
+        tracker = ObstacleTracker(rotations=rotations)
+        for k, frame in enumerate(frames):
+            tracker.update(0.1 * k, frame)
+            scene = tracker.scene(0.1 * k + delay)
+        return tracker, scene
+
+    (one, here), (other, there) = last(), by_numpy(last)
+    for name in ("positions", "quaternions", "sizes", "velocities", "angular_velocities", "covariances", "stamps"):
+        np.testing.assert_allclose(getattr(here.packed, name), getattr(there.packed, name), rtol=0.0, atol=1e-9)
+    assert (here.packed.still, here.packed.rotating) == (there.packed.still, there.packed.rotating)
+    assert here.packed.fastest == pytest.approx(there.packed.fastest)
+    assert repr(here) == repr(there)
+    for a, b in zip(here.obstacles, there.obstacles, strict=True):
+        assert (a.name, a.track_id) == (b.name, b.track_id)
+        np.testing.assert_allclose(a.covariance, b.covariance, rtol=0.0, atol=1e-9)
+    for a, b in zip(one.tracks, other.tracks, strict=True):
+        assert (a.track_id, a.label, a.last_seen) == (b.track_id, b.label, b.last_seen)
+    for name in ("hits", "ages", "counts", "sizes"):
+        values = [getattr(tracker._steps[-1].tracks, name) for tracker in (one, other)]
+        np.testing.assert_allclose(*values, rtol=0.0, atol=1e-12)
+
+
+def test_a_track_that_is_not_confirmed_is_not_in_the_scene():
+    tracker = ObstacleTracker()
+    balls = [Detection(Sphere([x, 0.0, 0.0], 0.05), 1e-5 * np.eye(3)) for x in (0.0, 1.0)]
+    for k in range(4):
+        tracker.update(0.1 * k, balls[: 1 + (k == 3)])
+    assert (tracker._steps[-1].tracks.ids == UNCONFIRMED).tolist() == [False, True]
+    assert len(tracker.scene(0.4).packed) == 1
+
+
+def test_copies_of_tracker_and_scene_go_on_alike():
+    """Copies contain no address of the original's memory."""
+    frames = frames_of(np.random.default_rng(0))
+    tracker = ObstacleTracker()
+    for k, frame in enumerate(frames[:5]):
+        tracker.update(0.1 * k, frame)
+    scene = tracker.scene(0.45)
+    copies = [pickle.loads(pickle.dumps((tracker, scene))), copy.deepcopy((tracker, scene))]
+    expected = ClearanceLimit(ARM, 2.0).rows(ARM.home, scene)
+    tracker.update(0.5, frames[5])
+    for other, seen in copies:
+        rows = ClearanceLimit(ARM, 2.0).rows(ARM.home, seen)
+        np.testing.assert_array_equal(rows.matrix, expected.matrix)
+        np.testing.assert_array_equal(rows.lower, expected.lower)
+        other.update(0.5, frames[5])
+        np.testing.assert_array_equal(other.scene(0.5).packed.positions, tracker.scene(0.5).packed.positions)

@@ -28,7 +28,8 @@ _FUNCTIONS: dict[str, tuple[Any, ...]] = {
     "obstacle_rows": (_P, _D, _D, *[_P] * 12),
     "sphere_centers": (_P, _P),
     "self_rows": (*[_P] * 3, _I, _D, _D, _I, _D, _D, _D, *[_P] * 6),
-    "track_kernel_update": (*[_I] * 3, *[_D] * 4, *[_P] * 4),
+    "track_obstacles": (_I, _I, _D, _D, *[_P] * 3),
+    "track_update": (*[_I] * 4, *[_D] * 5, *[_P] * 3),
 }
 
 
@@ -77,6 +78,23 @@ def address(array: NDArray[Any]) -> int:
         return place
 
 
+class Block:
+    """An array of real numbers and its address, both of which compiled code needs in every step.
+
+    Attributes:
+        array: the numbers, which follow each other in memory.
+        address: address of the array.
+    """
+
+    __slots__ = ("address", "array")
+
+    def __init__(self, array: NDArray[np.float64]) -> None:
+        self.array, self.address = array, address(array)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Block, (self.array,)
+
+
 class Record:
     """A C structure of whole numbers (``int64_t``), real numbers (``double``), arrays, and lists of other structures.
 
@@ -107,6 +125,20 @@ class Record:
                 values.append(address(places))
         self._memory = np.array(values, dtype=np.int64)
         self.address: int = address(self._memory)
+
+    @classmethod
+    def at(cls, place: int, *kept: object) -> Record:
+        """Return a record that compiled code has written; the record keeps references to what the structure points to.
+
+        Such a record can't be copied to another process.
+
+        Args:
+            place: address of the structure.
+            kept: the memory of the structure, and other objects to which the structure points.
+        """
+        record = object.__new__(cls)
+        record.address, record._memory = place, kept  # type: ignore[assignment]
+        return record
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Record, self._fields

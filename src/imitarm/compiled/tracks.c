@@ -1,13 +1,47 @@
-/* One update of all tracks, for the usual case: one model of motion, and no doubt about the assignment.
+/* One update of all tracks, for the usual case: one model of motion, and no doubt about the assignment. And all tracks,
+ * predicted to another time.
  *
- * The same computation as MotionFilter.predict, assign and MotionFilter.update, which are the reference. */
+ * The same computation as MotionFilter.predict, assign, MotionFilter.update and ObstacleTracker._seen, which are the
+ * reference. */
+
+#include "shapes.h"
 
 #include <math.h>
-#include <stdint.h>
 #include <string.h>
 
 #define MAX_STATE 9
-#define ROW 15 /* position (3), covariance (9), size (3) */
+#define ROW 19         /* position (3), covariance (9), size (3), quaternion (4) */
+#define FULL_COUNT 10  /* as in imitarm.perception.tracks */
+#define UNCONFIRMED -1 /* the same */
+#define ALL_SEEN 1     /* every track is confirmed and has one of the detections, and no detection is left */
+#define IN_ORDER 2     /* and detection i belongs to track i */
+#define RESIZED 4      /* and a smoothed size has changed */
+
+/* n tracks in one block of memory, as imitarm.perception.track_memory lays them out. */
+typedef struct {
+    double *x, *P, *sizes, *quaternions, *last_seen; /* (n, s), (n, s, s), (n, 3), (n, 4), (n) */
+    int64_t *hits, *ages, *counts, *ids;             /* (n) */
+    double *distances;                               /* (n) of the assigned detections */
+    int64_t *detections, *owners;                    /* (n), (m) */
+} Tracks;
+
+static Tracks tracks_at(double *block, int64_t n, int64_t s)
+{
+    Tracks t;
+    t.x = block;
+    t.P = t.x + n * s;
+    t.sizes = t.P + n * s * s;
+    t.quaternions = t.sizes + 3 * n;
+    t.last_seen = t.quaternions + 4 * n;
+    t.hits = (int64_t *)(t.last_seen + n);
+    t.ages = t.hits + n;
+    t.counts = t.ages + n;
+    t.ids = t.counts + n;
+    t.distances = (double *)(t.ids + n);
+    t.detections = (int64_t *)(t.distances + n);
+    t.owners = t.detections + n;
+    return t;
+}
 
 static double trace(const double *matrix, int64_t stride) { return matrix[0] + matrix[stride + 1] + matrix[2 * stride + 2]; }
 
@@ -28,7 +62,9 @@ static void inverse(double *out, const double *m)
 static void predict(double *x, double *P, double dt, double q, int64_t s)
 {
     int64_t order = s / 3 - 1;
-    double factor[3] = {1.0, dt, 0.5 * dt * dt}, weight[3] = {1.0, 1.0, 0.5}, *row, *column;
+    double factor[3] = {1.0, dt, 0.5 * dt * dt}, weight[3] = {1.0, 1.0, 0.5}, powers[6] = {1.0}, *row, *column;
+    for (int64_t i = 1; i < 6; i++)
+        powers[i] = dt * powers[i - 1];
     for (int64_t i = 0; i < order; i++)
         for (int64_t k = i + 1; k <= order; k++)
             for (int c = 0; c < 3; c++)
@@ -50,7 +86,7 @@ static void predict(double *x, double *P, double dt, double q, int64_t s)
     for (int64_t i = 0; i <= order; i++)
         for (int64_t j = 0; j <= order; j++) {
             int64_t left = order - i, right = order - j, power = left + right + 1;
-            double noise = q * weight[left] * weight[right] / (double)power * pow(dt, (double)power);
+            double noise = q * weight[left] * weight[right] / (double)power * powers[power];
             for (int c = 0; c < 3; c++)
                 P[(3 * i + c) * s + 3 * j + c] += noise;
         }
@@ -94,66 +130,148 @@ static void correct(double *x, double *P, const double *row, int64_t s)
     }
 }
 
-/* Update n tracks with m detections. Returns 0, or 1 when the assignment is not obvious: then the results are void.
- *
- * Tracks with first[i] = 1 choose before the others, where it is 0.
- * states: in and out; states (n, s), covariances (n, s, s), then out: distances (n). rows (m, ROW).
- * indices: out: index of the detection of each track (n) or -1; then the track of each detection (m) or -1. */
-int64_t track_kernel_update(int64_t n, int64_t m, int64_t s, double dt, double q, double gate, double max_speed,
-                            double *states, const double *rows, const int8_t *first, int64_t *indices)
+/* Two detections of one obstacle? */
+static int doubled(const double *rows, int64_t m, double gate)
 {
-    double *x = states, *P = states + n * s, *distances = states + n * s + n * s * s;
-    int64_t *detections = indices, *owners = indices + n;
-    double nu[3], inverted[9];
-    if (s > MAX_STATE || dt < 0.0)
-        return 1;
-    for (int64_t j = 0; j < m; j++) {
-        owners[j] = -1;
-        for (int64_t k = 0; k < j; k++) { /* two detections of one obstacle? */
+    for (int64_t j = 0; j < m; j++)
+        for (int64_t k = 0; k < j; k++) {
+            const double *a = rows + ROW * j, *b = rows + ROW * k;
             double squared = 0.0;
             for (int c = 0; c < 3; c++)
-                squared += (rows[ROW * j + c] - rows[ROW * k + c]) * (rows[ROW * j + c] - rows[ROW * k + c]);
-            if (squared <= gate * (trace(rows + ROW * j + 3, 3) + trace(rows + ROW * k + 3, 3)))
+                squared += (a[c] - b[c]) * (a[c] - b[c]);
+            if (squared <= gate * (trace(a + 3, 3) + trace(b + 3, 3)))
                 return 1;
         }
-    }
-    for (int64_t i = 0; i < n; i++)
-        predict(x + s * i, P + s * s * i, dt, q, s);
-    for (int confirmed = 1; confirmed >= 0; confirmed--)
+    return 0;
+}
+
+/* Give each track its detection, or -1; returns how many have one, or -1 when more than one assignment is possible. */
+static int64_t assign(Tracks *t, int64_t n, int64_t m, int64_t s, const double *rows, double gate)
+{
+    double nu[3], inverted[9];
+    int64_t found = 0;
+    for (int64_t j = 0; j < m; j++)
+        t->owners[j] = -1;
+    for (int confirmed = 1; confirmed >= 0; confirmed--) /* confirmed tracks choose before the others */
         for (int64_t i = 0; i < n; i++) {
-            const double *xi = x + s * i, *Pi = P + s * s * i;
-            if (first[i] != confirmed)
+            const double *x = t->x + s * i, *P = t->P + s * s * i;
+            if ((t->ids[i] != UNCONFIRMED) != confirmed)
                 continue;
-            detections[i] = -1;
+            t->detections[i] = -1;
             for (int64_t j = 0; j < m; j++) {
                 const double *row = rows + ROW * j;
                 double squared = 0.0;
-                if (owners[j] >= 0 && first[owners[j]] && !confirmed)
+                if (!confirmed && t->owners[j] >= 0 && t->ids[t->owners[j]] != UNCONFIRMED)
                     continue;
                 for (int c = 0; c < 3; c++)
-                    squared += (row[c] - xi[c]) * (row[c] - xi[c]);
-                if (squared > gate * (trace(Pi, s) + trace(row + 3, 3)))
+                    squared += (row[c] - x[c]) * (row[c] - x[c]);
+                if (squared > gate * (trace(P, s) + trace(row + 3, 3)))
                     continue;
-                double distance = innovation(nu, inverted, xi, Pi, row, s);
+                double distance = innovation(nu, inverted, x, P, row, s);
                 if (!(distance <= gate))
                     continue;
-                if (detections[i] >= 0 || owners[j] >= 0)
-                    return 1;
-                detections[i] = j;
-                owners[j] = i;
-                distances[i] = distance;
+                if (t->detections[i] >= 0 || t->owners[j] >= 0)
+                    return -1;
+                t->detections[i] = j;
+                t->owners[j] = i;
+                t->distances[i] = distance;
+                found++;
             }
         }
+    return found;
+}
+
+static void cap(double *v, double most)
+{
+    double squared = v[0] * v[0] + v[1] * v[1] + v[2] * v[2];
+    if (squared > most * most)
+        for (int c = 0; c < 3; c++)
+            v[c] *= most / sqrt(squared);
+}
+
+/* Take over what else the detections say, when every track has one; returns flags. */
+static int64_t take_over(Tracks *t, int64_t n, const double *rows, double stamp, int64_t mask)
+{
+    int64_t flags = ALL_SEEN | IN_ORDER;
     for (int64_t i = 0; i < n; i++) {
-        if (detections[i] < 0)
-            continue;
-        double *xi = x + s * i, squared = 0.0;
-        correct(xi, P + s * s * i, rows + ROW * detections[i], s);
-        for (int c = 3; c < 6; c++)
-            squared += xi[c] * xi[c];
-        if (squared > max_speed * max_speed)
-            for (int c = 3; c < 6; c++)
-                xi[c] *= max_speed / sqrt(squared);
+        const double *row = rows + ROW * t->detections[i];
+        double weight = (double)(++t->counts[i] < FULL_COUNT ? t->counts[i] : FULL_COUNT);
+        t->hits[i] = (t->hits[i] << 1 & mask) | 1;
+        t->ages[i]++;
+        t->last_seen[i] = stamp;
+        for (int c = 0; c < 3; c++) {
+            double error = row[12 + c] - t->sizes[3 * i + c];
+            t->sizes[3 * i + c] += error / weight;
+            flags |= error != 0.0 ? RESIZED : 0;
+        }
+        memcpy(t->quaternions + 4 * i, row + 15, 4 * sizeof(double));
+        if (t->detections[i] != i)
+            flags &= ~IN_ORDER;
     }
+    return flags;
+}
+
+/* Update n tracks with m detections (m, ROW). Returns flags, or -1 when the assignment is not obvious: then the new
+ * block is void. Without the flag ALL_SEEN, only states, covariances, distances and detections are new.
+ *
+ * mask: the bits of hits that are kept. before, after: blocks of the tracks. */
+int64_t track_update(int64_t n, int64_t m, int64_t s, int64_t mask, double stamp, double dt, double q, double gate,
+                     double max_speed, const double *before, const double *rows, double *after)
+{
+    Tracks t = tracks_at(after, n, s);
+    int all_confirmed = 1;
+    if (s > MAX_STATE || dt < 0.0 || doubled(rows, m, gate))
+        return -1;
+    memcpy(after, before, (size_t)((double *)t.distances - after) * sizeof *after);
+    for (int64_t i = 0; i < n; i++)
+        predict(t.x + s * i, t.P + s * s * i, dt, q, s);
+    int64_t found = assign(&t, n, m, s, rows, gate);
+    if (found < 0)
+        return -1;
+    for (int64_t i = 0; i < n; i++) {
+        all_confirmed = all_confirmed && t.ids[i] != UNCONFIRMED;
+        if (t.detections[i] < 0)
+            continue;
+        correct(t.x + s * i, t.P + s * s * i, rows + ROW * t.detections[i], s);
+        cap(t.x + s * i + 3, max_speed);
+    }
+    return all_confirmed && found == n && n == m ? take_over(&t, n, rows, stamp, mask) : 0;
+}
+
+/* The obstacles of all tracks, dt later, where dt >= 0; they do not rotate.
+ *
+ * shapes: the same obstacles at any time. Out: the structure Obstacles; positions, velocities and angular velocities
+ * (n, 3); covariances (n, 3, 3); times at which they were seen (n); the square of the largest speed (1). Other arrays
+ * are those of the shapes, or of the block. */
+int64_t track_obstacles(int64_t n, int64_t s, double dt, double q, double *block, const Obstacles *shapes, double *out)
+{
+    Tracks t = tracks_at(block, n, s);
+    Obstacles *placed = (Obstacles *)out;
+    double *positions = out + sizeof(Obstacles) / sizeof(double), *velocities = positions + 3 * n;
+    double *rates = velocities + 3 * n, *covariances = rates + 3 * n, *stamps = covariances + 9 * n;
+    double x[MAX_STATE], P[MAX_STATE * MAX_STATE], fastest = 0.0;
+    if (s > MAX_STATE || dt < 0.0)
+        return -1;
+    for (int64_t i = 0; i < n; i++) {
+        memcpy(x, t.x + s * i, (size_t)s * sizeof *x);
+        memcpy(P, t.P + s * s * i, (size_t)(s * s) * sizeof *P);
+        predict(x, P, dt, q, s);
+        memcpy(positions + 3 * i, x, 3 * sizeof *x);
+        memcpy(velocities + 3 * i, x + 3, 3 * sizeof *x);
+        for (int r = 0; r < 3; r++) {
+            rates[3 * i + r] = 0.0;
+            memcpy(covariances + 9 * i + 3 * r, P + s * r, 3 * sizeof *P);
+        }
+        stamps[i] = t.last_seen[i];
+        fastest = fmax(fastest, x[3] * x[3] + x[4] * x[4] + x[5] * x[5]);
+    }
+    *placed = *shapes;
+    placed->positions = positions;
+    placed->quaternions = t.quaternions;
+    placed->velocities = velocities;
+    placed->rates = rates;
+    placed->covariances = covariances;
+    placed->stamps = stamps;
+    stamps[n] = fastest;
     return 0;
 }

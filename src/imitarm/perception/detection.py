@@ -36,8 +36,10 @@ class Detection:
             that are not empty never belong to the same obstacle.
         camera_to_base: pose of the camera that took the measurement. Only the extended Kalman filter uses it.
         solid: geometry of the obstacle, without pose and velocity.
-        row: position (3), covariance (9) and size (3) in one row, shape (15,). The row's variances are increased by 1
-            nm^2, so that the covariance matrix of an exact detection can be inverted.
+        row: position (3), covariance (9), size (3) and quaternion (4) in one row, shape (19,). The row's variances are
+            increased by 1 nm^2, so that the covariance matrix of an exact detection can be inverted.
+        row_bytes: the same row as bytes, for compiled code.
+        outline: label, kind and name of the obstacle in one text; empty for a convex hull.
 
     Raises:
         InputError: when the obstacle is a half-space or is behind the camera, or the covariance is not symmetric and
@@ -50,6 +52,8 @@ class Detection:
     camera_to_base: Pose | None = None
     solid: Solid = field(init=False, repr=False)
     row: Array = field(init=False, repr=False)
+    row_bytes: bytes = field(init=False, repr=False)
+    outline: str = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not isinstance(self.obstacle, Obstacle):
@@ -65,11 +69,12 @@ class Detection:
         object.__setattr__(self, "covariance", covariance)
         solid = self.obstacle.solid()
         size = np.asarray(solid.size, dtype=float)
-        row = np.concatenate([solid.position, (covariance + _FLOOR * np.eye(3)).ravel(), size])
-        object.__setattr__(self, "solid", solid)
-        object.__setattr__(self, "row", row)
+        row = np.concatenate([solid.position, (covariance + _FLOOR * np.eye(3)).ravel(), size, solid.quaternion])
         if not text(self.label, "Detection: label").isprintable():
             raise InputError(f"Detection: label must be one line of text, got {self.label!r}")
+        outline = "" if solid.polytope is not None else f"{self.label}\n{solid.kind} {self.obstacle.name}"
+        for name, value in {"solid": solid, "row": row, "row_bytes": row.tobytes(), "outline": outline}.items():
+            object.__setattr__(self, name, value)
         if self.camera_to_base is not None:
             camera = instance(self.camera_to_base, Pose, "Detection: camera_to_base")
             depth = float(camera.inverse().apply(self.position)[2])
@@ -87,10 +92,7 @@ class Detection:
     def repeats(self, other: Detection) -> bool:
         """Return whether ``other`` has the same shape, pose, covariance and label as this detection."""
         return self is other or (
-            self.solid.kind == other.solid.kind
-            and self.label == other.label
-            and bool((self.row == other.row).all())
-            and bool((self.solid.quaternion == other.solid.quaternion).all())
+            self.solid.kind == other.solid.kind and self.label == other.label and bool((self.row == other.row).all())
         )
 
 

@@ -9,8 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.compiled import library
-from imitarm.compiled.kernels import address
 from imitarm.errors import InputError
 from imitarm.validation import choice, finite_number
 
@@ -365,47 +363,3 @@ def _checked_noise(noise: float | Sequence[float], orders: tuple[int, ...]) -> t
         finite_number(q, "ObstacleTracker: process_noise", units[order], at_least=0.0)
         for q, order in zip(given, orders, strict=True)
     )
-
-
-def updated(
-    mean: Array,
-    covariance: Array,
-    first: NDArray[np.bool_],
-    dt: float,
-    noise: float,
-    rows: Array,
-    gate: float,
-    max_speed: float,
-) -> tuple[Array, Array, Indices, Array] | None:
-    """Predict and update all tracks by compiled code; None if this code is missing or the assignment is ambiguous.
-
-    The compiled code computes the same values as :meth:`MotionFilter.predict`, ``assign`` and
-    :meth:`MotionFilter.update`.
-
-    Args:
-        mean: states of n tracks, each with s components, shape (n, 1, s).
-        covariance: covariances of these states, shape (n, 1, s, s).
-        first: whether each track chooses its detection before the other tracks, shape (n,).
-        dt: time from these states to the detections [s].
-        noise: spectral density of the process noise [m^2/s^3].
-        rows: rows of m detections (:attr:`Detection.row`), shape (m, 15).
-        gate: largest normalised innovation squared of a possible assignment.
-        max_speed: largest speed [m/s].
-
-    Returns:
-        New states and covariances of the same shapes; the index of each track's detection (n,), -1 for no detection;
-        the normalised innovation squared of each track (n,), meaningless for a track without a detection.
-    """
-    kernel = library()
-    if kernel is None:
-        return None
-    n, _, s = mean.shape
-    states = np.empty(n * s + n * s * s + n)
-    x, P = states[: n * s].reshape(mean.shape), states[n * s : -n].reshape(covariance.shape)
-    x[:] = mean
-    P[:] = covariance
-    indices = np.empty(n + len(rows), dtype=np.int64)
-    places = [address(array) for array in (states, rows, first, indices)]
-    if kernel.track_kernel_update(n, len(rows), s, dt, noise, gate, max_speed, *places):
-        return None
-    return x, P, indices[:n], states[-n:]

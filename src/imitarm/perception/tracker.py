@@ -15,8 +15,9 @@ from imitarm.kinematics.pose import Pose
 from imitarm.perception.association import Pairs, assigned, duplicates
 from imitarm.perception.consistency import Consistency, chi_square_quantile
 from imitarm.perception.detection import Detection
-from imitarm.perception.motion_filter import Belief, Measurements, MotionFilter, updated
+from imitarm.perception.motion_filter import Belief, Measurements, MotionFilter
 from imitarm.perception.rotation_rate import Rates, turned, turned_on
+from imitarm.perception.track_memory import ALL_SEEN, IN_ORDER, RESIZED, obstacles, updated
 from imitarm.perception.tracks import UNCONFIRMED, TrackedObstacle, Tracks, smoothed_sizes
 from imitarm.scene import Obstacle, Scene
 from imitarm.validation import finite_number, instance, sequence, whole_number
@@ -24,7 +25,7 @@ from imitarm.validation import finite_number, instance, sequence, whole_number
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-_NO_ROWS = np.zeros((0, 15))
+_ROW = 19  # numbers in a row of a detection
 _RESET = 10.0  # [s] a stamp that goes back by more was given by another clock
 _RECENT = 300  # updates whose innovations are kept
 
@@ -123,6 +124,7 @@ class ObstacleTracker:
         self.max_obstacles = whole_number(max_obstacles, "ObstacleTracker: max_obstacles", at_least=1)
         self.history = finite_number(history, "ObstacleTracker: history", "s", at_least=0.0)
         self.rotations = instance(rotations, bool, "ObstacleTracker: rotations")
+        self._compiles = len(self.filter.orders) == 1 and motion != "ekf"
         self.reset()
 
     def reset(self) -> None:
@@ -132,7 +134,7 @@ class ObstacleTracker:
         self._distances: deque[Array] = deque(maxlen=_RECENT)
         self._forgotten = False  # whether steps are no longer kept
         self._scene: Scene | None = None
-        self._shapes: tuple[object, ...] = ()  # of the obstacles in it
+        self._form: tuple[object, ...] = ()  # of the tracks in it
 
     @property
     def stamp(self) -> float | None:
@@ -204,15 +206,19 @@ class ObstacleTracker:
         if not self._steps:
             return Scene(goal, (), time, tuple(fixtures))
         tracks = self._steps[-1].tracks
-        rows = np.array([track.row for track in self.tracks], dtype=np.intp)
-        base, known = self._scene, self._shapes
-        shapes = tracks.shapes(rows)
-        if base is None or known != shapes or base.goal is not goal or base.fixtures != tuple(fixtures):
-            obstacles = tuple(track.obstacle for track in self.tracks)
-            self._scene = base = Scene(goal, obstacles, tracks.stamp, tuple(fixtures))
-            self._shapes = shapes
+        base, form = self._scene, tracks.form
+        same = self._form is form or self._form == form
+        if base is None or not same or base.goal is not goal or base.fixtures != tuple(fixtures):
+            seen = tuple(track.obstacle for track in self.tracks)
+            self._scene = base = Scene(goal, seen, tracks.stamp, tuple(fixtures))
+        self._form = form
         if not len(base.packed):
             return replace(base, stamp=time)
+        if self._compiles and not self.rotations and tracks.in_order:
+            placed = obstacles(tracks.memory, time - tracks.stamp, self.filter.noise[0], base.packed)
+            if placed is not None:
+                return Scene.predicted(base, placed, time)
+        rows = np.array(tracks.order, dtype=np.intp)
         mean, covariance = tracks.filter.predict(tracks.belief.rows(rows), time - tracks.stamp).combined()
         last_seen, rates = tracks.last_seen[rows], tracks.reported_rates[rows]
         rotations = turned_on(tracks.quaternions(rows), rates, time - last_seen)
@@ -263,11 +269,13 @@ class ObstacleTracker:
 
     def _advanced(self, tracks: Tracks, stamp: float, detections: tuple[Detection, ...]) -> _Step:
         """Return the tracks after one update."""
-        given = detections
-        table = np.array([d.row for d in detections]) if detections else _NO_ROWS
-        compiled = self._compiled(tracks, stamp, detections, table)
-        if compiled is None:
-            measured = self._measurements(detections, table)
+        given, rows = detections, b"".join([d.row_bytes for d in detections])
+        known = self._compiled(tracks, stamp, detections, rows)
+        if isinstance(known, _Step):
+            return known
+        table = np.frombuffer(rows).reshape(-1, _ROW)
+        measured = self._measurements(detections, table)
+        if known is None:
             tracks = tracks.at(stamp)
             apart = self._merged(detections, measured)
             if apart is not None:
@@ -276,16 +284,8 @@ class ObstacleTracker:
             pairs = assigned(tracks, detections, measured, self.gate)
             belief = self._corrected(tracks.belief, pairs, measured)
         else:
-            belief, pairs = compiled
-            if len(pairs.tracks) == len(tracks) == len(detections) and tracks.all_confirmed:
-                ordered = tuple([detections[i] for i in pairs.detections.tolist()])
-                if tracks.alike(ordered):
-                    now = tracks.changed(stamp=stamp, belief=belief)
-                    rates = self._turned(now, pairs, detections)
-                    now = now.all_seen(ordered, table[pairs.detections, 12:], rates, self.confirm[1])
-                    return _Step(stamp, given, now, pairs.distances)
-            measured = Measurements(table[:, :3], table[:, 3:12].reshape(-1, 3, 3))
-        tracks = self._seen(tracks.changed(stamp=stamp, belief=belief), pairs, detections, table[:, 12:])
+            belief, pairs = known
+        tracks = self._seen(tracks.changed(stamp=stamp, belief=belief), pairs, detections, table[:, 12:15])
         tracks = self._pruned(tracks)
         if len(pairs.detections) < len(detections):
             free = np.ones(len(detections), dtype=bool)
@@ -296,23 +296,38 @@ class ObstacleTracker:
         return _Step(stamp, given, self._confirmed(tracks), pairs.distances)
 
     def _compiled(
-        self, tracks: Tracks, stamp: float, detections: tuple[Detection, ...], table: Array
-    ) -> tuple[Belief, Pairs] | None:
-        """Return beliefs and pairs from compiled code; None if it is not built, or can't decide the assignment."""
-        if len(self.filter.orders) > 1 or self.motion == "ekf" or not len(tracks):
+        self, tracks: Tracks, stamp: float, detections: tuple[Detection, ...], rows: bytes
+    ) -> _Step | tuple[Belief, Pairs] | None:
+        """Return the result of compiled code: the whole step if all tracks were seen, otherwise beliefs and pairs.
+
+        None: the compiled code is not built, or can't decide the assignment.
+        """
+        if not self._compiles or not len(tracks.ids):
             return None
-        mean, covariance, weights = tracks.belief
         dt, (noise,) = stamp - tracks.stamp, self.filter.noise
-        found = updated(mean, covariance, tracks.ids != UNCONFIRMED, dt, noise, table, self.gate, self.max_speed)
+        numbers, window = (noise, self.gate, self.max_speed), self.confirm[1]
+        found = updated(tracks.memory, stamp, dt, rows, *numbers, window=window)
         if found is None:
             return None
-        index, labels = found[2], tracks.labels
+        memory, flags = found
+        if flags & ALL_SEEN:
+            index = None if flags & IN_ORDER else memory.array("detected")
+            ordered = detections if index is None else tuple([detections[i] for i in index.tolist()])
+            outlines = [d.outline for d in ordered]
+            if outlines == tracks.outlines and "" not in outlines:
+                rates = self._turned(tracks, stamp, np.arange(len(ordered)), ordered)
+                now = tracks.in_memory(memory, stamp, ordered, rates)
+                if not flags & RESIZED and "form" in tracks.__dict__:
+                    now.__dict__["form"] = tracks.form
+                return _Step(stamp, detections, now, memory.array("distances"))
+        index, labels = memory.array("detected"), tracks.labels
         if any(labels):
             for label, i in zip(labels, index.tolist(), strict=True):
                 if i >= 0 and label != (other := detections[i].label) and label and other:
                     return None
-        rows = (index >= 0).nonzero()[0]
-        return Belief(found[0], found[1], weights), Pairs(rows, index[rows], found[3][rows])
+        seen = (index >= 0).nonzero()[0]
+        belief = Belief(memory.array("mean"), memory.array("covariance"), np.ones((memory.n, 1)))
+        return belief, Pairs(seen, index[seen], memory.array("distances")[seen])
 
     def _measurements(self, detections: tuple[Detection, ...], table: Array) -> Measurements:
         """Return the detections, whose rows are ``table`` (k, 15), as measurements."""
@@ -360,7 +375,7 @@ class ObstacleTracker:
         last_seen, counts = tracks.last_seen.copy(), tracks.counts.copy()
         last_seen[rows] = tracks.stamp
         seen, labels = list(tracks.detections), list(tracks.labels)
-        rates = self._turned(tracks, pairs, detections)
+        rates = self._turned(tracks, tracks.stamp, rows, [detections[i] for i in columns.tolist()])
         for row, index in zip(rows.tolist(), columns.tolist(), strict=True):
             detection = detections[index]
             if detection.solid.kind != seen[row].solid.kind:
@@ -379,16 +394,14 @@ class ObstacleTracker:
             labels=tuple(labels),
         )
 
-    def _turned(self, tracks: Tracks, pairs: Pairs, detections: tuple[Detection, ...]) -> Rates:
-        """Return the angular velocities after the assigned detections."""
-        rows = pairs.tracks
+    def _turned(self, tracks: Tracks, stamp: float, rows: Indices, detections: Sequence[Detection]) -> Rates:
+        """Return the angular velocities after detections at ``stamp`` of the tracks with the indices ``rows``."""
         if not self.rotations:
             return tracks.rates
-        before = [tracks.detections[i].solid for i in rows.tolist()]
-        now = [detections[i].solid for i in pairs.detections.tolist()]
+        before, now = [tracks.detections[i].solid for i in rows.tolist()], [d.solid for d in detections]
         kinds = [b.kind if a.kind == b.kind else "sphere" for a, b in zip(before, now, strict=True)]
         turns = turned(kinds, np.array([a.quaternion for a in before]), np.array([b.quaternion for b in now]))
-        return tracks.rates.seen(rows, turns, tracks.stamp - tracks.last_seen[rows])
+        return tracks.rates.seen(rows, turns, stamp - tracks.last_seen[rows])
 
     def _cap(self, mean: Array) -> None:
         """Scale down speeds above ``max_speed`` in the states (..., m)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from imitarm.html_table import html_table
 from imitarm.perception.detection import Detection, estimated, resized
 from imitarm.perception.motion_filter import Belief, MotionFilter
 from imitarm.perception.rotation_rate import Rates, turned_on
+from imitarm.perception.track_memory import TrackMemory
 from imitarm.scene import Obstacle
 from imitarm.validation import finite_number
 
@@ -61,9 +63,68 @@ class Tracks:
     def changed(self, **changes: object) -> Tracks:
         """Return a copy with new values for some attributes; faster than :func:`dataclasses.replace`."""
         copied = object.__new__(Tracks)
-        values = self.__dict__
-        copied.__dict__.update({key: values[key] for key in _ATTRIBUTES}, **changes)
+        copied.__dict__.update({key: getattr(self, key) for key in _ATTRIBUTES}, **changes)
         return copied
+
+    @cached_property
+    def memory(self) -> TrackMemory:
+        """The tracks in one block of memory, for compiled code."""
+        columns = {name: getattr(self, name) for name in (*_IN_MEMORY, "ids")}
+        quaternions = np.array([detection.solid.quaternion for detection in self.detections]).reshape(-1, 4)
+        return TrackMemory.of(self.belief.mean, self.belief.covariance, quaternions, columns)
+
+    def in_memory(self, memory: TrackMemory, stamp: float, detections: tuple[Detection, ...], rates: Rates) -> Tracks:
+        """Return confirmed tracks after a detection of each of them, which compiled code has computed.
+
+        Arrays are made when they are first read.
+
+        Args:
+            memory: the new tracks.
+            stamp: time of the detections [s].
+            detections: in the order of the tracks; each has the outline of the detection before.
+            rates: new angular velocities.
+        """
+        seen, values = object.__new__(Tracks), self.__dict__
+        seen.__dict__.update({key: values[key] for key in _LASTING}, memory=memory, stamp=stamp, rates=rates)
+        seen.__dict__.update(
+            detections=detections, all_confirmed=True, outlines=self.outlines, order=self.order, in_order=self.in_order
+        )
+        return seen
+
+    def __getattr__(self, name: str) -> Any:
+        """Make the arrays of tracks that are in a block of memory; reject unknown attributes."""
+        memory: TrackMemory | None = self.__dict__.get("memory")
+        if memory is None or (name not in _IN_MEMORY and name != "belief"):
+            raise AttributeError(f"Tracks has no attribute {name!r}")
+        value: Any
+        if name == "belief":
+            value = Belief(memory.array("mean"), memory.array("covariance"), np.ones((memory.n, 1)))
+        else:
+            value = memory.array(name)
+        object.__setattr__(self, name, value)
+        return value
+
+    @cached_property
+    def outlines(self) -> list[str]:
+        """Label, kind and name of each track as last detected; empty for a convex hull."""
+        return [detection.outline for detection in self.detections]
+
+    @cached_property
+    def order(self) -> list[int]:
+        """The indices of the confirmed tracks, in the order of their numbers."""
+        rows = self.confirmed
+        order: list[int] = rows[self.ids[rows].argsort()].tolist()
+        return order
+
+    @cached_property
+    def in_order(self) -> bool:
+        """Whether all tracks are confirmed, and in the order of their numbers."""
+        return self.order == list(range(len(self.ids)))
+
+    @cached_property
+    def form(self) -> tuple[object, ...]:
+        """What does not change while the confirmed tracks only move: number, name, shape and size of each of them."""
+        return self.shapes(np.array(self.order, dtype=np.intp))
 
     @classmethod
     def none(cls, motion_filter: MotionFilter, stamp: float, next_id: int = 0) -> Tracks:
@@ -123,34 +184,6 @@ class Tracks:
         """Mean (n, m) and covariance (n, m, m) of each obstacle's state, combined over all models of motion."""
         return self.belief.combined()
 
-    def alike(self, detections: tuple[Detection, ...]) -> bool:
-        """Whether each detection, in the order of the tracks, has the track's kind of shape and an empty label."""
-        return not any(
-            d.label or d.solid.kind != t.solid.kind for d, t in zip(detections, self.detections, strict=True)
-        )
-
-    def all_seen(self, detections: tuple[Detection, ...], sizes: Array, rates: Rates, window: int) -> Tracks:
-        """Return the tracks after an update with one detection of each track; all must be confirmed and :meth:`alike`.
-
-        Args:
-            detections: one detection of each track, in the order of the tracks.
-            sizes: measured sizes, shape (n, 3) [m].
-            rates: angular velocities after this update.
-            window: number of updates that ``hits`` stores.
-        """
-        counts = self.counts + 1
-        seen = self.changed(
-            hits=(self.hits << 1 & (1 << window) - 1) | 1,
-            ages=self.ages + 1,
-            last_seen=np.full(len(counts), self.stamp),
-            sizes=smoothed_sizes(self.sizes, np.arange(len(counts)), sizes, counts),
-            counts=counts,
-            rates=rates,
-            detections=detections,
-        )
-        seen.__dict__["all_confirmed"] = True
-        return seen
-
     def shapes(self, rows: Indices) -> tuple[object, ...]:
         """Return number, name, shape and size of each track; equal results mean that the tracks have only moved."""
         parts: list[object] = [self.sizes[rows].tobytes()]
@@ -182,14 +215,12 @@ class Tracks:
     @cached_property
     def view(self) -> tuple[TrackedObstacle, ...]:
         """The confirmed tracks, in the order of their numbers."""
-        numbers = self.ids.tolist()
-        if numbers == sorted(numbers) and (not numbers or numbers[0] != UNCONFIRMED):  # the usual case
-            return tuple([TrackedObstacle(self, row) for row in range(len(numbers))])
-        rows = self.confirmed
-        return tuple([TrackedObstacle(self, row) for row in rows[self.ids[rows].argsort()].tolist()])
+        return tuple([TrackedObstacle(self, row) for row in self.order])
 
 
 _ATTRIBUTES = tuple(Tracks.__dataclass_fields__)
+_LASTING = "filter", "ids", "labels", "next_id"  # what does not change while every track is seen
+_IN_MEMORY = "last_seen", "hits", "ages", "sizes", "counts"
 
 
 class TrackedObstacle:

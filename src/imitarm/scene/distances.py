@@ -116,8 +116,8 @@ class PackedObstacles:
             return self
         if self.rotating:
             turned = quaternion_multiply(quaternion_exp(dt * self.angular_velocities), self.quaternions)
-            return self._copy(positions=self.positions + dt * self.velocities, quaternions=turned)
-        return self._copy(_ahead=(self, dt))  # positions and frames are computed when they are first used
+            return self.copy(positions=self.positions + dt * self.velocities, quaternions=turned)
+        return self.copy(_ahead=(self, dt))  # positions and frames are computed when they are first used
 
     def placed(
         self,
@@ -133,7 +133,7 @@ class PackedObstacles:
         Each of the other arguments is the new value of the attribute with the same name; without ``covariances``, the
         covariances are kept.
         """
-        moved = self._copy(
+        moved = self.copy(
             positions=positions,
             quaternions=quaternions,
             velocities=velocities,
@@ -150,11 +150,14 @@ class PackedObstacles:
         rows = {name: getattr(self, name)[indices] for name in _ROWS}
         return PackedObstacles(**rows, polytopes=tuple(self.polytopes[i] for i in indices.tolist()))
 
-    def _copy(self, **changes: object) -> PackedObstacles:
+    def copy(self, **changes: object) -> PackedObstacles:
         """Return a copy with other poses; the copy shares the values that were computed for the shapes."""
         moved = object.__new__(PackedObstacles)
         moved.__dict__.update(self._shapes, **changes)
         return moved
+
+    def __getstate__(self) -> dict[str, object]:
+        return {key: value for key, value in self.__dict__.items() if key != "_record"}  # it contains addresses
 
     def __getattr__(self, name: str) -> Array:
         """Compute ``positions`` when they are first read from a result of :meth:`after`; reject unknown attributes."""

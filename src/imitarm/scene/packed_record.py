@@ -1,17 +1,21 @@
-"""Packed obstacles as a C structure, for compiled code."""
+"""Packed obstacles as a C structure, for compiled code, and packed obstacles that compiled code has placed."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from imitarm.compiled.kernels import Record
+from imitarm.compiled.kernels import Block, Record
 from imitarm.scene.convex_hull import Polytope
 from imitarm.scene.distances import PackedObstacles
 
 Array = NDArray[np.float64]
+
+RECORD_WORDS = 11
+"""Number of 8-byte words of the C structure ``Obstacles``."""
 
 
 def record_of(packed: PackedObstacles) -> tuple[Record, float]:
@@ -26,6 +30,32 @@ def record_of(packed: PackedObstacles) -> tuple[Record, float]:
             known = _built(packed), 0.0
         packed.__dict__["_record"] = known
     return known
+
+
+def placed_by(shapes: PackedObstacles, block: Block, quaternions: Array, *kept: object) -> PackedObstacles:
+    """Return obstacles that ``track_obstacles`` in ``compiled/tracks.c`` has placed; they do not rotate.
+
+    Args:
+        shapes: the same n obstacles at another time.
+        block: the C structure ``Obstacles``, then positions, velocities and angular velocities (n, 3), covariances (n,
+            3, 3), times of the last detections (n), and the square of the largest speed (1).
+        quaternions: rotations, shape (n, 4).
+        kept: other objects to whose memory the structure points.
+    """
+    n, words, a = len(shapes), block.array, RECORD_WORDS
+    fastest = math.sqrt(words.item(-1))
+    return shapes.copy(
+        positions=words[a : a + 3 * n].reshape(n, 3),
+        quaternions=quaternions,
+        velocities=words[a + 3 * n : a + 6 * n].reshape(n, 3),
+        angular_velocities=words[a + 6 * n : a + 9 * n].reshape(n, 3),
+        covariances=words[a + 9 * n : a + 18 * n].reshape(n, 3, 3),
+        stamps=words[a + 18 * n : a + 19 * n],
+        still=fastest == 0.0,
+        rotating=False,
+        fastest=fastest,
+        _record=(Record.at(block.address, block, shapes, *kept), 0.0),
+    )
 
 
 def _built(packed: PackedObstacles) -> Record:
