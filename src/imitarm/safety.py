@@ -31,7 +31,7 @@ _ROUNDING = 1e-9  # [m/s, rad/s]
 
 
 class Cause(NamedTuple):
-    """Why a safety filter changed a command: it would have brought these two parts too near to each other.
+    """The two parts that the command would have brought too near to each other, so that the filter changed the command.
 
     Attributes:
         link: name of the part of the arm, as in the robot's file.
@@ -53,11 +53,11 @@ class SafetyStep:
 
     Attributes:
         velocity: joint velocity to send, shape (n_joints,) [rad/s].
-        changed: norm of the difference between ``velocity`` and the velocity without clearances, which keeps only the
-            joint limits [rad/s]; 0 if no clearance inequality was active.
+        changed: norm of the change that the clearances caused, compared with a velocity that keeps only the joint
+            limits [rad/s]; 0 if no clearance inequality was active.
         slack: largest violation of a clearance inequality [m/s]; 0 when all inequalities are kept.
-        safe: whether ``velocity`` keeps every limit and every clearance inequality; if False, no joint velocity keeps
-            them all.
+        safe: whether ``velocity`` keeps every joint limit and every clearance inequality. If False, no joint velocity
+            keeps them all.
         cause: the pair that required the largest change of the command; None if the filter changed nothing.
     """
 
@@ -76,28 +76,27 @@ class SafetyStep:
 class SafetyFilter:
     r"""Converts commands to joint velocities that keep the arm's limits and its clearances.
 
-    In each step, one quadratic program (:class:`~imitarm.kinematics.ik.IKSolver`) finds the joint velocity nearest to
-    the command.
-    This velocity meets two conditions:
+    In each step, one quadratic program (:class:`~imitarm.kinematics.ik.IKSolver`) finds the joint velocity that is
+    nearest to the command and meets two conditions:
 
-    * The velocity always stays inside the position, velocity and acceleration limits of the joints.
-    * No part of the arm approaches an obstacle faster than allowed by
-      :class:`~imitarm.scene.clearance_limit.ClearanceLimit`, and no link approaches another link faster than allowed by
-      :class:`~imitarm.scene.clearance.SelfClearance`. An arm at rest yields to an obstacle that moves towards it.
+    * The velocity stays inside the position, velocity and acceleration limits of the joints.
+    * No part of the arm approaches an obstacle faster than :class:`~imitarm.scene.clearance_limit.ClearanceLimit`
+      allows. No link approaches another link faster than :class:`~imitarm.scene.clearance.SelfClearance` allows. An arm
+      at rest yields to an obstacle that moves towards it.
 
-    If these inequalities :math:`A \dot q \ge b` contradict the joint limits, no safe motion exists, and ``safe`` is
-    False. The filter then ignores the command.
-    No distance may then shrink faster than during full braking:
+    The second condition is a set of inequalities :math:`A \dot q \ge b` for the joint velocity. If they contradict the
+    joint limits, no safe motion exists, and ``safe`` is False. The filter then ignores the command, and no distance may
+    shrink faster than during full braking:
 
     .. math:: A\, \dot q \;\ge\; \min(b,\; A\, \dot q_b), \qquad \dot q_b = \dot q_p \max(0, 1 - dt / t_b)
 
-    Among the velocities that keep this limit, the filter takes the velocity with the least sum of squared violations of
-    the inequalities. Here, :math:`\dot q_p` is the previous velocity, :math:`a_j` is the acceleration limit of joint j,
-    and :math:`t_b = \max_j
-    |\dot q_{p,j}| / a_j` is the time in which all joints together can brake to rest. If a collision can't be avoided,
-    the arm therefore moves away as fast as it can, or at least brakes as hard as it can.
+    Here, :math:`\dot q_p` is the previous velocity and dt the control period. :math:`t_b = \max_j |\dot q_{p,j}| / a_j`
+    is the time in which all joints together can brake to rest, where :math:`a_j` is the acceleration limit of joint j.
+    Among the velocities that keep this relaxed limit, the filter takes the one with the least sum of squared violations
+    of :math:`A \dot q \ge b`. If a collision can't be avoided, the arm therefore moves away as fast as it can, or at
+    least brakes as hard as it can.
 
-    All policies and teleoperation use this filter.
+    Every policy and teleoperation send their commands through this filter.
 
     Args:
         arm: the arm with its tool.
@@ -105,17 +104,19 @@ class SafetyFilter:
         clearance: required distance of every part of the arm to every obstacle [m]; None: obstacles are ignored.
         allowance: margin added to the clearance, because no robot moves exactly as commanded [m].
         self_clearance: required distance between links that are not neighbours [m]; None: not checked.
-        limits: limits of the inverse kinematics; None: position, velocity and acceleration of each joint.
+        limits: limits that the inverse kinematics keeps; None: the limits of position, velocity and acceleration of
+            each joint.
         method: method of the inverse kinematics. Only ``"qp"`` keeps clearances; with another method, ``clearance`` and
             ``self_clearance`` must be None.
         latency: time between a command and the motion of the arm [s].
-        margin: bound of the error of a predicted obstacle position, which is added to the clearance. It is evaluated at
-            the obstacle's age (time since it was seen) plus ``latency``. None: predictions count as exact.
-        deviations: for obstacles with a covariance, this many standard deviations of the position are also added to the
-            clearance.
+        margin: upper bound of the error of an obstacle's predicted position, as a function of the prediction time. The
+            filter adds this bound to the clearance. The prediction time is the time since the obstacle was seen plus
+            ``latency``. None: predictions count as exact.
+        deviations: number of standard deviations of an obstacle's position that are also added to the clearance, if the
+            obstacle has a covariance.
 
     Raises:
-        InputError: when a number can't be used, or the method can't keep a required clearance.
+        InputError: when a number is out of range, or a clearance is required but ``method`` can't keep it.
     """
 
     def __init__(

@@ -1,16 +1,17 @@
 r"""Fitting: find a start posture and a scale that bring a recorded motion within the robot's reach.
 
-Only a recording can be fitted, because a live motion is not known in advance. The position of the tool will be
+Only a recording can be fitted, because a live motion is not known in advance. In the fitted motion, the position of the
+tool at time t is
 
 .. math:: p(t) = p_0 + \rho\,(W(t) - W_0)
 
 where :math:`W` is the position of the person's wrist along the axes of the base, :math:`W_0` its position when the
 robot begins to follow (the clutch engages), :math:`p_0` the start position of the tool, and :math:`\rho` the scale. For
 each scale, the search places the middle of the motion at positions near the tool's home position, and then at positions
-throughout the workspace. The scale is reduced until the arm reaches the start and the six outermost points of the
-motion. At the start and at the six outermost points, the tool must have the same orientation as at home. The arm must
-be away from singularities, and its links must keep a minimum distance from each other and from the fixtures on which
-the arm stands.
+throughout the workspace. The search reduces the scale until the arm reaches seven points of the motion: its start and
+the points with the smallest and the largest x, y and z. At these points, the tool must have the same orientation as at
+home, and the arm must be away from singularities. The links must keep a minimum distance from each other and from the
+fixtures (the objects on which the arm stands).
 """
 
 from __future__ import annotations
@@ -70,19 +71,19 @@ def fit_motion(
 
     Args:
         arm: the robot's arm.
-        wrist: positions of the person's wrist along the axes of the robot's base, shape (n, 3) [m]; rows with nan are
-            skipped.
-        start: position of the person's wrist when the robot begins to follow, shape (3,) [m].
+        wrist: positions of the person's wrist, shape (n, 3) [m]. The axes must be parallel to those of the robot's
+            base; the origin is arbitrary. Rows with nan are skipped.
+        start: position of the wrist when the robot begins to follow the person, in the same frame, shape (3,) [m].
         scale: the largest scale to try.
         fixtures: objects on which the arm stands or works, which it must not touch; None: a floor and a pedestal
             (:func:`~imitarm.scene.standard_fixtures`).
 
     Returns:
-        The largest scale that was found, and the start posture for it.
+        The largest scale at which the arm reaches the motion, and the start posture for this scale.
 
     Raises:
-        InputError: if the wrist was never seen, or an argument can't be used.
-        UnreachableError: if the motion is not within reach even at a seventh of its size.
+        InputError: if all rows of ``wrist`` contain nan, ``start`` contains nan, or an argument is invalid.
+        UnreachableError: if the arm can't reach the motion at any scale down to 0.15.
     """
     instance(arm, ArmModel, "arm")
     path, begin = real_array(wrist, (None, 3), "wrist", "m"), real_array(start, (3,), "start", "m")

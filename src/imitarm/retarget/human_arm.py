@@ -22,7 +22,7 @@ from imitarm.retarget.limbs import LimbLengths
 Array = NDArray[np.float64]
 
 AXES = ("z", "y", "x", "y", "x", "y", "x")
-"""Rotation axis of each joint angle of the chain when all angles are zero."""
+"""Rotation axis of each joint when all joint angles are zero."""
 
 HUMAN_ARM_DH = (
     np.array([0.0, 0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0]),
@@ -49,12 +49,12 @@ def dh_transform(theta: ArrayLike, d: ArrayLike, a: ArrayLike, alpha: ArrayLike,
         0 & s_\alpha & c_\alpha & d \\ 0 & 0 & 0 & 1 \end{pmatrix}
 
     Args:
-        theta: angle about the previous z axis [rad]; like all four parameters, a number or an array.
+        theta: angle about the previous z axis [rad]. Each of the four parameters is a number or an array.
         d: distance along the previous z axis [m].
         a: distance along the new x axis [m].
         alpha: angle about the new x axis [rad].
-        as_printed: whether to use the second row of the matrix as printed in the thesis, with sin instead of cos. The
-            rotational part of the transform is then not a rotation.
+        as_printed: whether to use the matrix as printed in the thesis, whose second row has sin instead of cos. With
+            this misprint, the upper left 3 x 3 block is not a rotation matrix.
 
     Returns:
         Transforms, shape (..., 4, 4).
@@ -75,14 +75,14 @@ def dh_transform(theta: ArrayLike, d: ArrayLike, a: ArrayLike, alpha: ArrayLike,
 def human_arm_frames(angles: ArrayLike, lengths: LimbLengths, *, as_printed: bool = False) -> Array:
     """Return the frames of the Denavit-Hartenberg chain relative to the shoulder (thesis Eq 3.5).
 
-    The thesis prints no Denavit-Hartenberg table for the arm, so :data:`HUMAN_ARM_DH` is our table for the chain of
-    this module. Frame 3 is at the elbow, and frame 5 at the wrist. Frame 7 is the frame of the hand, with x along the
-    hand and z out of the back of the hand.
+    The thesis prints no Denavit-Hartenberg table for the arm; the function uses the table :data:`HUMAN_ARM_DH` of this
+    library. Frame 3 is at the elbow, and frame 5 at the wrist. Frame 7 is the frame of the hand, with x along the hand
+    and z out of the back of the hand.
 
     Args:
         angles: joint angles, shape (7,) [rad].
         lengths: bone lengths of the person's arm.
-        as_printed: whether to use the matrices as printed in the thesis, whose rotational parts are not rotations.
+        as_printed: whether to use the misprinted matrices of the thesis (see :func:`dh_transform`).
 
     Returns:
         The transforms of frames 0 to 7, shape (8, 4, 4); frame 0 is the shoulder's frame.
@@ -99,13 +99,16 @@ def human_arm_frames(angles: ArrayLike, lengths: LimbLengths, *, as_printed: boo
 
 
 def human_arm_pose(angles: ArrayLike, lengths: LimbLengths) -> tuple[Array, Array, Array]:
-    """Return elbow (3,), wrist (3,) [m] and hand rotation (3, 3) relative to the shoulder, for angles (7,) [rad]."""
+    """Return elbow (3,), wrist (3,) [m] and the hand's rotation matrix (3, 3), all in the shoulder's frame."""
     elbow, wrist, hand, _ = _chain(np.asarray(angles, dtype=float), lengths)
     return elbow, wrist, hand
 
 
 def human_arm_jacobian(angles: ArrayLike, lengths: LimbLengths) -> Array:
-    """Return the Jacobian of wrist and hand in the shoulder's frame, shape (6, 7), linear rows first."""
+    """Return the Jacobian in the shoulder's frame, shape (6, 7).
+
+    Rows 0 to 2 give the wrist's velocity, rows 3 to 5 the hand's angular velocity.
+    """
     elbow, wrist, _, axes = _chain(np.asarray(angles, dtype=float), lengths)
     origins = np.array([np.zeros(3)] * 3 + [elbow] * 2 + [wrist] * 2)
     return np.concatenate([np.cross(axes, wrist - origins).T, axes.T])
@@ -137,15 +140,15 @@ def _rotation_about(axis: str, angle: float) -> Array:
 def human_arm_angles(upper: ArrayLike, forearm: ArrayLike, hand: ArrayLike, previous: ArrayLike | None = None) -> Array:
     """Return the seven joint angles of a person's arm in closed form, shape (7,) [rad].
 
-    An angle that is undefined keeps its previous value. The first angle is undefined when the upper arm is along z, the
-    third when the arm is straight, and the fifth when the hand is in line with the forearm. The wrist has two
-    solutions; the function returns the solution closer to the previous angles.
+    An angle that is undefined keeps its previous value. Three angles can be undefined: the first when the upper arm is
+    along z, the third when the arm is straight, and the fifth when the hand is in line with the forearm. Two sets of
+    wrist angles give the same rotation of the hand. The function returns the set that is closer to the previous angles.
 
     Args:
         upper: unit vector from shoulder to elbow, shape (3,).
         forearm: unit vector from elbow to wrist, shape (3,).
-        hand: rotation of the hand, shape (3, 3).
-        previous: angles of the previous frame, shape (7,); None: zeros.
+        hand: rotation matrix of the hand, in the same frame as ``upper`` and ``forearm``, shape (3, 3).
+        previous: joint angles in the previous camera frame, shape (7,) [rad]; None: zeros.
 
     Returns:
         shape (7,) [rad].
@@ -194,8 +197,8 @@ def _wrapped(angles: Array) -> Array:
 def hand_rotation(wrist: Array, tip: Array, thumb: Array) -> Array | None:
     r"""Return the hand's rotation from wrist, tip and thumb; None when these points do not determine it.
 
-    Shoulder, elbow and wrist alone do not show how the forearm is rotated or how the wrist is bent. Let W be the wrist,
-    and let a bar denote a vector scaled to length 1. With :math:`x = \overline{tip - W}` and
+    The positions of shoulder, elbow and wrist do not show how the forearm is rotated about its axis or how the wrist is
+    bent. Let W be the wrist, and let a bar denote a vector scaled to length 1. With :math:`x = \overline{tip - W}` and
     :math:`n = \overline{x \times (thumb - W)}`, the rotation matrix is :math:`[x,\; n \times x,\; n]`.
 
     Args:
@@ -204,8 +207,8 @@ def hand_rotation(wrist: Array, tip: Array, thumb: Array) -> Array | None:
         thumb: position of the thumb's tip, shape (3,) [m].
 
     Returns:
-        Rotation matrix, shape (3, 3); None when the angle between hand and thumb is less than 12 degrees, or a point is
-        not plausible.
+        Rotation matrix, shape (3, 3); None when the angle between hand and thumb is less than 12 degrees, or when tip
+        or thumb is too close to the wrist.
     """
     # plain floats: for nine numbers three times as fast as NumPy
     x0, x1, x2 = (tip - wrist).tolist()
@@ -223,17 +226,17 @@ def hand_rotation(wrist: Array, tip: Array, thumb: Array) -> Array | None:
 
 
 def carried(rotation: Array | None, before: Array | None, after: Array) -> Array:
-    """Return the rotation of a hand that is not visible, after a rotation of the forearm.
+    """Estimate the rotation of a hidden hand, assuming that the hand has turned with the forearm.
 
     Args:
-        rotation: previous rotation of the hand, shape (3, 3); None: unknown, so the function assumes that the hand's x
-            is along the forearm and its z is horizontal.
+        rotation: previous rotation of the hand, shape (3, 3); None: unknown. The function then assumes that the hand's
+            x axis is along the forearm and its y axis is horizontal.
         before: unit vector along the forearm when the hand had this rotation, shape (3,).
         after: unit vector along the forearm now, shape (3,).
 
     Returns:
-        The new rotation of the hand, shape (3, 3): ``rotation`` after the smallest rotation that takes ``before`` to
-            ``after``.
+        The new rotation matrix of the hand, shape (3, 3): the smallest rotation from ``before`` to ``after``, applied
+        to ``rotation``.
     """
     if rotation is None or before is None:
         side = _cross(np.array([0.0, 0.0, 1.0]), after)

@@ -32,11 +32,11 @@ class LimbLengths:
     Attributes:
         upper_arm: distance from shoulder to elbow [m].
         forearm: distance from elbow to wrist [m].
-        spread: for each of the two lengths, the standard deviation of its measurements about their median [m].
-        n_frames: number of frames used for the measurement; 0 when the lengths were given.
+        spread: standard deviation of the measured values of each length, from their median absolute deviation [m].
+        n_frames: number of frames in which the lengths were measured; 0 if they were given without a measurement.
 
     Raises:
-        InputError: when a length is not plausible for an arm.
+        InputError: when a length is not between 0.1 and 0.6 m, or ``spread`` or ``n_frames`` is negative.
     """
 
     upper_arm: float
@@ -65,7 +65,7 @@ class LimbLengths:
 
     @property
     def accepted(self) -> bool:
-        """Whether the lengths are known to within 5 mm."""
+        """Whether the standard error of both lengths is below 5 mm."""
         return self.standard_error < ACCEPTED
 
     @property
@@ -75,11 +75,13 @@ class LimbLengths:
 
 
 def measure_limbs(skeletons: Iterable[Skeleton], side: str = "right") -> LimbLengths:
-    """Measure the bone lengths of an arm as medians over frames in which it is tracked and slow (docs/capture.md).
+    """Measure the bone lengths of an arm as medians over frames in which the whole arm is tracked (docs/capture.md).
+
+    Frames in which the arm moves fast are ignored if at least five other frames remain.
 
     Args:
-        skeletons: skeletons in order of time; two seconds are enough.
-        side: side of the arm, ``"left"`` or ``"right"``.
+        skeletons: skeletons in order of time; a recording of two seconds is long enough.
+        side: which arm of the person to measure, ``"left"`` or ``"right"``.
 
     Raises:
         InputError: when fewer than five frames show the whole arm, or the lengths are not plausible.
@@ -119,14 +121,15 @@ def correct_limbs(
 
     Args:
         shoulder: measured shoulder position, shape (..., 3) [m].
-        elbow: measured elbow position, same shape.
-        wrist: measured wrist position, same shape.
+        elbow: measured elbow position, shape (..., 3) [m].
+        wrist: measured wrist position, shape (..., 3) [m].
         lengths: bone lengths of this person's arm.
-        as_printed: whether to use the equations as printed in the thesis: their signs place the elbow on the wrong side
-            of the shoulder, and the forearm begins at the measured elbow instead of the corrected elbow.
+        as_printed: whether to use the equations as printed in the thesis. Their signs place the elbow on the wrong side
+            of the shoulder. In addition, the printed forearm begins at the measured elbow instead of the corrected
+            elbow.
 
     Returns:
-        elbow and wrist, shapes (..., 3) [m].
+        the corrected positions of elbow and wrist, shape (..., 3) [m] each.
     """
     s, e, w = (np.asarray(point, dtype=float) for point in (shoulder, elbow, wrist))
     upper, fore = _direction(e - s), _direction(w - e)
@@ -139,23 +142,24 @@ def correct_limbs(
 def fit_limbs(points: Array, confidence: Array, lengths: LimbLengths, *, rounds: int = 3) -> Array:
     r"""Move shoulder, elbow and wrist as little as possible so that the bones have their true lengths.
 
-    The function minimises the sum of the squared displacements, weighted by the confidences :math:`c_j`. If the
-    measurement errors of the points are independent and Gaussian, the result is the most likely posture of the arm.
+    Point j (shoulder, elbow or wrist) moves from its measured position :math:`\tilde x_j` to :math:`x_j`. The function
+    minimises the sum of the squared displacements, weighted by the confidences :math:`c_j`. If the measurement errors
+    of the points are independent and Gaussian, the result is the most likely posture of the arm.
 
     .. math:: \min \sum_j c_j |x_j - \tilde x_j|^2 \quad\text{s.t.}\quad |E - S| = L_U,\; |W - E| = L_F
 
     A few Gauss-Newton steps solve this minimisation problem. Each step solves a 2 x 2 system of equations for the
-    Lagrange multipliers. :func:`correct_limbs` is the special case in which the shoulder is assumed to be exact and
-    only the directions of the bones are used, so the errors of shoulder and elbow are transferred to the wrist.
+    Lagrange multipliers. In contrast, :func:`correct_limbs` assumes that the shoulder is exact, and uses only the
+    directions of the bones. It therefore transfers the errors of shoulder and elbow to the wrist.
 
     Args:
-        points: shoulder, elbow, wrist, shape (3, 3) [m].
+        points: measured positions of shoulder, elbow and wrist, one row each, shape (3, 3) [m].
         confidence: confidence of each point, above 0, shape (3,).
         lengths: bone lengths of this person's arm.
         rounds: number of Gauss-Newton steps.
 
     Returns:
-        shoulder, elbow, wrist, shape (3, 3) [m]; the bones have exactly the given lengths.
+        positions of shoulder, elbow and wrist, shape (3, 3) [m]. Their distances are exactly the given lengths.
     """
     # plain floats: for nine numbers five times as fast as NumPy
     (sx, sy, sz), (ex, ey, ez), (wx, wy, wz) = points.tolist()

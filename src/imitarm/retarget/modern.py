@@ -1,4 +1,4 @@
-"""ModernRetargeter: the recommended method; it keeps all limits, follows the elbow and bridges tracking losses."""
+"""ModernRetargeter: the recommended method to convert the motion of a person's arm to the motion of a robot."""
 
 from __future__ import annotations
 
@@ -49,17 +49,18 @@ class ModernRetargeter(Retargeter):
 
     Each control step consists of four parts (see docs/retargeting.md):
 
-    1. extrapolate the estimate of the person's arm (:class:`~imitarm.retarget.arm_estimator.ArmEstimator`) from its
-       last frame with a decaying velocity. After s seconds, the wrist is at :math:`W + v\,\tau(1 - e^{-s/\tau})`, with
-       :math:`\tau` = 50 ms and the wrist's position W and velocity v at the last frame;
-    2. compute the tool's target and the twist towards it, :math:`K \log(T_d T^{-1})`, plus a fraction of the hand's
-       velocity (feed-forward);
-    3. solve a quadratic programme for the joint velocities. The quadratic programme has two tasks: the twist of the
-       tool and the elbow's SEW angle (shoulder-elbow-wrist). The constraints of the programme are the joint limits of
-       position, velocity and acceleration, the distances of the links to each other and to the scene, and bounds that
-       keep elbow and wrist away from their singularities. While the robot follows nobody, it is at rest;
-    4. limit the jerk of the joints (:class:`JerkLimiter`) and check all limits again. If something blocks the arm, the
-       arm does not push harder, and the target stays near the blocked tool.
+    1. Extrapolate the arm estimate (:class:`~imitarm.retarget.arm_estimator.ArmEstimator`) from the last camera frame
+       with a decaying velocity. Let W be the wrist's position and v its velocity at the last frame. After s seconds,
+       the wrist is at :math:`W + v\,\tau(1 - e^{-s/\tau})`, with :math:`\tau` = 50 ms.
+    2. Compute the tool's target pose :math:`T_d` and the twist from the tool's pose T towards the target: :math:`K
+       \log(T_d T^{-1})` plus a fraction of the hand's velocity (feed-forward).
+    3. Solve a quadratic programme for the joint velocities. Its two tasks are the twist of the tool and the elbow angle
+       (the SEW angle: the angle of the plane through shoulder, elbow and wrist). Its constraints are the joint limits
+       of position, velocity and acceleration, and minimum distances between the links and from the links to obstacles.
+       Further constraints keep elbow and wrist away from their singularities. While the robot follows nobody, the
+       desired twist is zero.
+    4. Limit the jerk of the joints, and limit their position, velocity and acceleration again (:class:`JerkLimiter`).
+       If something blocks the arm, the arm does not push harder, and the target stays near the blocked tool.
 
     Let :math:`\psi_0` and :math:`\psi_{h,0}` be the elbow angles of robot and person when the robot began to follow the
     person. If the person's elbow angle is now :math:`\psi_h`, the desired elbow angle of the robot is
@@ -67,8 +68,8 @@ class ModernRetargeter(Retargeter):
     person's elbow poorly, and when the person's or the robot's arm is nearly straight.
 
     When the camera loses the person, the robot continues along the extrapolated motion for 0.1 s, then holds its
-    target, and stops 0.3 s after the loss. Once the person has been seen again for half a second, the motion restarts
-    from the current poses of hand and tool, so that nothing jumps.
+    target, and stops 0.3 s after the loss. When the camera has seen the person again for half a second, the robot
+    follows again from the current poses of hand and tool. The target therefore does not jump.
 
     Args:
         arm: the robot's arm with its tool.
@@ -77,14 +78,16 @@ class ModernRetargeter(Retargeter):
         scene: obstacles to avoid.
         gain: gain K of the twist towards the target [1/s].
         lead: fraction of the hand's velocity that is fed forward, 0 to 1.
-        rotation_length: position error [m] that counts as much as a rotation error of one radian about the base's x, y
-            and z axes; used when the joints can't achieve both position and rotation. None: a value that depends on the
-            orientation of the correspondence. It is 0.1 m for ``"hand"``, because a camera measures the hand's rotation
-            poorly; 0.3 m for ``"fixed"``; and for ``"upright"`` 0.2 m about x and y (tilt) and 0.05 m about z.
-        elbow: weight of the elbow task relative to the tool's task [m^2]; 0: the elbow is free.
+        rotation_length: position error [m] that counts as much as a rotation error of one radian, if the joints can't
+            correct both errors. Pass one number, or three numbers for rotations about the base's x, y and z axes. With
+            None, the value depends on ``correspondence.orientation``: 0.1 m for ``"hand"``, because a camera measures
+            the hand's rotation poorly, and 0.3 m for ``"fixed"``. For ``"upright"``, it is 0.2 m about x and y (tilt)
+            and 0.05 m about z.
+        elbow: weight of the elbow task relative to the tool's task [m^2]; 0: the robot's elbow does not follow the
+            person's.
         clearance: required distance between the arm and the obstacles [m].
         own_clearance: required distance between the arm's own links [m]; None: not checked.
-        max_speed: largest norm of the twist [m/s], with 1 rad counted as ``rotation_length``.
+        max_speed: largest norm of the tool's twist [m/s]; a rotation of 1 rad counts as ``rotation_length``.
         max_lead: largest distance by which the command of a joint may be ahead of the measured position [rad]; a robot
             with a longer delay needs a larger value.
 
@@ -263,25 +266,25 @@ class ModernRetargeter(Retargeter):
 class JerkLimiter:
     r"""Makes the joints follow a reference, and limits their position, velocity, acceleration and jerk.
 
-    The limiter is a critically damped follower with feed-forward, whose acceleration is :math:`a_d = \omega^2 (q_r - q)
-    + 2\omega (v_r - v)` for a reference with position :math:`q_r` and velocity :math:`v_r`. The acceleration is clipped
-    to :math:`|a| \le a_{max}` and to :math:`|a - a_p| \le j\,dt`, where :math:`a_p` is the previous acceleration and j
-    the jerk limit. The resulting velocity :math:`v + a\,dt` is then clipped so that the joint can still stop before its
-    limit. Let D be the distance to the limit and a the largest acceleration. Each step moves the joint by the mean of
-    two successive velocities times dt. The highest velocity from which the joint can still stop is then
+    The reference of a joint has the position :math:`q_r` and the velocity :math:`v_r`; the joint itself has the
+    commanded position q and velocity v. A critically damped follower computes the desired acceleration :math:`a_d =
+    \omega^2 (q_r - q) + 2\omega (v_r - v)`. This acceleration is clipped to :math:`|a| \le a_{max}` and to :math:`|a -
+    a_p| \le j\,dt`, where :math:`a_p` is the previous acceleration and j the jerk limit. The resulting velocity
+    :math:`v + a\,dt` is then clipped so that the joint can still stop before its limit. Each step moves the joint by
+    the mean of two successive velocities times dt. Let D be the distance to the position limit. In the next equation, a
+    is :math:`a_{max}`. The highest velocity from which the joint can still stop is
 
-    .. math:: v_b = -\tfrac12 a\,dt + \sqrt{\tfrac14 a^2 dt^2 + 2 a D'}, \qquad D' = D - \tfrac12 v\,dt,
+    .. math:: v_b = -\tfrac12 a\,dt + \sqrt{\tfrac14 a^2 dt^2 + 2 a D'}, \qquad D' = D - \tfrac12 v\,dt.
 
-    If D' is negative, the bound is :math:`2 D'/dt` instead.
+    If D' is negative, the bound :math:`v_b` is :math:`2 D'/dt` instead.
 
-    A joint whose velocity is at most :math:`v_b` in one step can keep to this bound in all later steps by braking with
-    a_max. Near a position limit, clipping the velocity to :math:`v_b` may exceed the jerk limit, but the limits of
-    position, velocity and acceleration are always kept.
+    If the velocity of a joint is at most :math:`v_b` in one step, braking with :math:`a_{max}` keeps it within the
+    bound in all later steps. Near a position limit, clipping the velocity to :math:`v_b` may exceed the jerk limit. The
+    limits of position, velocity and acceleration are always kept.
 
-    A blocked arm falls behind its commands, and its drives push harder as the error grows. The command of a joint
-    therefore brakes when it is ahead of the measured position by more than half of ``max_lead``, as if ``max_lead``
-    were an additional position limit. While the command brakes, its distance from the measured position may exceed half
-    of ``max_lead`` by the braking distance.
+    A blocked arm falls behind its commands, and its drives push harder as the error grows. Therefore, when the command
+    of a joint is ahead of the measured position by more than half of ``max_lead``, the command brakes. It brakes as if
+    the joint had a position limit at the distance ``max_lead`` from the measured position.
 
     Args:
         arm: arm model that provides the joint limits.
@@ -289,9 +292,8 @@ class JerkLimiter:
         frequency: natural frequency omega of the follower [rad/s]; must be well below 1/dt.
         rise_time: shortest time in which the acceleration rises from 0 to a_max [s]; the jerk limit is j = a_max /
             rise_time.
-        max_lead: largest distance by which a command may be ahead of the measured position [rad]. Half of ``max_lead``
-            must exceed the distance that a joint moves at full speed within the robot's delay; otherwise, the joints
-            are slowed down.
+        max_lead: largest distance by which a command may be ahead of the measured position [rad]. If a joint at full
+            speed moves by more than half of ``max_lead`` within the robot's delay, the limiter slows the joint down.
 
     Raises:
         InputError: when a number is out of range.

@@ -33,10 +33,10 @@ class RetargetStep:
 
     Attributes:
         time: time since :meth:`Retargeter.start` [s].
-        q: joint positions that the robot must reach by the end of the step, shape (n_joints,) [rad].
+        q: commanded joint positions at the end of the step, shape (n_joints,) [rad].
         velocity: joint velocities at the end of the step, shape (n_joints,) [rad/s].
         closed: whether the gripper should be closed; None: leave it as it is.
-        state: state of the engagement.
+        state: whether the robot waits, follows, coasts, holds its target or is stopped.
         target: desired pose of the tool in the base frame, before limits are applied; None while the robot follows
             nobody.
         elbow: unit vector from the person's shoulder to the elbow in the base frame, shape (3,); None when unknown.
@@ -56,10 +56,10 @@ class Goal(NamedTuple):
 
     Attributes:
         target: current desired pose of the tool in the base frame.
-        estimate: estimate of the person's arm, from the last frame that shows it.
-        fresh: whether the frame of the estimate arrived in this step.
-        age: time since the frame of the estimate arrived [s].
-        state: state of the engagement, which is FOLLOWING, COASTING or HOLDING.
+        estimate: estimate of the person's arm, from the last camera frame that shows the arm.
+        fresh: whether this camera frame arrived in the current control step.
+        age: time since this camera frame arrived [s].
+        state: FOLLOWING, COASTING or HOLDING; in the other states, the robot follows nobody.
         clutch: the poses of hand and tool when the robot began to follow the person.
     """
 
@@ -74,20 +74,20 @@ class Goal(NamedTuple):
 class Retargeter(ABC):
     """Converts a person's arm motion, given as skeletons, to joint positions of a robot arm.
 
-    :meth:`start` defines the posture in which the robot begins at rest. :meth:`step` is then called once per control
-    period ``dt`` with the skeleton that arrived since the last call, or None. Cameras deliver 30 frames per second, but
-    a robot takes 100 commands per second, so most calls receive None instead of a skeleton.
+    Call :meth:`start` with the posture in which the robot is at rest. Then call :meth:`step` once per control period
+    ``dt`` with the skeleton that arrived since the last call, or None. A camera delivers about 30 frames per second,
+    but a robot takes 100 commands per second. Most calls therefore receive None instead of a skeleton.
 
     Every control step has four parts, which are the same for all methods:
 
     1. ``_see`` computes an estimate of the person's arm from a new skeleton;
     2. the :class:`~imitarm.retarget.engagement.Engagement` decides whether the robot follows the person;
     3. if the robot follows the person, ``_hand`` and ``_target`` compute the desired pose of the tool;
-    4. ``_advance`` returns the joint positions of the next period: **this is the method**.
+    4. ``_advance`` returns the joint positions of the next period. Each method has its own ``_advance``.
 
-    A method is a subclass that implements ``_advance``. The subclass may also override the other functions whose names
-    begin with an underscore; these functions have default implementations. The subclass sets its ``name``, and its
-    ``title`` and ``caption`` for tables and reports::
+    A method is a subclass that implements ``_advance``. The subclass may also override other functions, such as
+    ``_see`` or ``_target``, which have default implementations. Its ``title`` and ``caption`` appear in tables and
+    reports::
 
         class Damped(Retargeter):
             name, title = "damped", "Damped least squares"
@@ -104,7 +104,8 @@ class Retargeter(ABC):
         name: name of the method, as in :data:`imitarm.retarget.RETARGETERS`; default: the class's name.
         title: title of the method in tables and reports; default: ``name``.
         caption: one sentence about the method for reports.
-        rule: durations after which the engagement changes its state.
+        rule: how long the person must be seen before the robot follows, and how long the person may be lost until it
+            stops.
         arm: the robot's arm with its tool.
         n_joints: number of joints of the arm.
         correspondence: how the person's motion maps to the robot: side, sensor pose, scale and orientation.
@@ -178,7 +179,7 @@ class Retargeter(ABC):
         The first call starts at ``arm.home`` unless :meth:`start` was called.
 
         Args:
-            skeleton: newest skeleton since the last step, or None.
+            skeleton: newest skeleton since the last step; None if no skeleton has arrived.
             q: measured joint positions, shape (n_joints,) [rad].
 
         Returns:
@@ -316,13 +317,13 @@ class Retargeting:
         targets: target positions (n, 3) [m] and quaternions wxyz (n, 4) of the tool; nan while the robot follows
             nobody.
         elbows: unit vectors from the person's shoulder to the elbow in the base frame, shape (n, 3); nan where unknown.
-        closed: whether the gripper should be closed, shape (n,) bool.
+        closed: whether the gripper should be closed at each sample, shape (n,) bool.
         states: states of the engagement, shape (n,), values of :class:`~imitarm.retarget.engagement.EngagementState`.
         notes: counts and other figures that the method reports, by name.
         title: title of the method for tables and reports; empty: ``method``.
         caption: one sentence about the method for reports.
-        shown_times: for each sample, the time at which the person made this part of the motion, counted from the first
-            skeleton, shape (n,) [s]; earlier than ``times`` for methods that slow the motion down. None: ``times``.
+        shown_times: time in the person's recording that corresponds to each sample, counted from the first skeleton,
+            shape (n,) [s]. Only methods that slow the motion down need it. None: equal to ``times``.
     """
 
     method: str

@@ -42,9 +42,9 @@ class OneEuro:
 
     The speed is the norm of the whole velocity vector, so the filter acts equally in all directions. The velocity is
     computed from the difference of two successive measured values. The original filter instead uses the difference
-    between a measured value and the previous smoothed value. The velocity of the original filter is too large for
-    predictions, because smoothed values lag behind measured values during steady motion. The weight :math:`\alpha` of a
-    value is multiplied by the value's confidence.
+    between a measured value and the previous smoothed value. During steady motion, smoothed values lag behind measured
+    values, so the original filter overestimates the velocity. The weight :math:`\alpha` of a value is multiplied by the
+    value's confidence.
 
     Args:
         min_cutoff: cut-off frequency at rest [Hz].
@@ -74,8 +74,9 @@ class OneEuro:
         Args:
             time: time of the measurement [s]; if it is not later than the previous time, the previous result is
                 returned.
-            x: one vector, shape (d,), or several vectors with separate speeds, shape (k, d).
-            confidence: confidence from 0 to 1; for several vectors one number or shape (k, 1).
+            x: one vector, shape (d,), or k vectors that are filtered separately, shape (k, d).
+            confidence: confidence of the measurement, from 0 to 1. For k vectors, pass one number for all, or an array
+                of shape (k, 1).
         """
         period = time - self._time
         if period <= 0.0:
@@ -116,7 +117,7 @@ class OneEuro:
 
 
 class OneEuroRotation(OneEuro):
-    """The One-Euro filter for rotations (quaternions wxyz); it filters rotation vectors in the base frame.
+    """The One-Euro filter for rotations, given as unit quaternions wxyz.
 
     The method ``filter`` takes a unit quaternion, shape (4,), and returns the smoothed quaternion. The attribute
     ``velocity`` is the angular velocity, shape (3,) [rad/s].
@@ -175,8 +176,8 @@ class Hampel:
     r"""Detects outliers: values too far from the median of a sliding window (Hampel identifier).
 
     A value x is an outlier if :math:`|x - \mathrm{med}| > \max(4 \cdot 1.4826\,\mathrm{MAD},\; r)`, where med is the
-    median of the window and MAD the median absolute deviation from it. A real jump is accepted after half the window,
-    when most values in the window are near the new value.
+    median of the window and MAD the median absolute deviation from it. After a real jump, the new values count as
+    outliers until they fill half of the window.
 
     Args:
         window: duration of the sliding window [s].
@@ -195,7 +196,7 @@ class Hampel:
         self._values.clear()
 
     def accept(self, time: float, x: Array) -> bool:
-        """Add a value (d,) to the window, and return whether it is consistent with the previous values."""
+        """Add a value (d,) to the window, and return False if the value is an outlier."""
         times, values, value = self._times, self._values, x.tolist()
         while times and (time - times[0] > self.window or time <= times[0]):
             times.popleft()
@@ -218,25 +219,24 @@ class TrackingOffsets:
 
     When a joint is hidden, a camera infers its position. The error of the inferred position is several times larger
     than the error of the tracked position. When the tracking state changes, the measured position jumps, mostly because
-    of the error of the inferred position. Therefore, when a joint becomes inferred, an offset o from the measured
-    position :math:`\tilde x` is chosen so that the motion continues,
+    of the error of the inferred position. When a joint becomes inferred, this class therefore adds an offset o to the
+    measured position :math:`\tilde x`. The offset is chosen so that the motion continues without a jump:
 
     .. math:: o = x_p + v\,\Delta t - \tilde x, \qquad x = \tilde x + o
 
     where x is the compensated position, :math:`x_p` the previous compensated position, v the velocity and :math:`\Delta
     t` the time step. While the joint is inferred, the offset is constant, so the compensated position changes by as
     much as the measured position. When the joint is tracked again, a new offset is chosen in the same way. While the
-    joint is tracked, the offset decays with time and with the distance :math:`|\Delta x|` that the joint moves,
+    joint is tracked, the offset decays with time and with the distance :math:`|\Delta x|` that the joint moves:
 
     .. math:: o \leftarrow o\,\exp(-\Delta t / T - |\Delta x| / L).
 
     A person who watches the robot does not notice the slow decay of the offset, but would notice if the robot jumped
     away and back.
 
-    A joint may flicker between tracked and inferred. Therefore the offset of each tracking state is kept for up to
-    0.12 s and used again when the state returns. If every change of the state started a new offset, the absolute
-    measured position would never have an effect, and the estimate would drift away. The length of an offset is at most
-    0.2 m.
+    A joint may flicker between tracked and inferred. If the joint returns to a state within 0.12 s, it therefore gets
+    its previous offset for this state again. With a new offset at every change, the position of a flickering joint
+    would drift away from the measured position. The length of an offset is at most 0.2 m.
 
     Args:
         time: time constant T with which the offset decays [s].

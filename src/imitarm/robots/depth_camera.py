@@ -18,15 +18,15 @@ _SEEN = np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)  # groups of geoms that hav
 class DepthCamera:
     """Takes depth images by casting one ray through each pixel.
 
-    The images are the same on every machine. They are exact, unless ``noise`` is given. For a camera like the Kinect v2
-    of the thesis, use ``nearest=0.5, farthest=5.0, noise=DepthNoise()``.
+    The images are the same on every machine. For a camera like the Kinect v2 of the thesis, use ``nearest=0.5,
+    farthest=5.0, noise=DepthNoise()``.
 
     Args:
         robot: simulated robot; the camera sees the world of this robot, including the arm.
         intrinsics: intrinsic parameters of the camera.
-        pose: camera_to_base for a fixed camera; camera_to_tool for a camera that is mounted on the tool. The
-            camera's frame has x to the right of the image, y down and z forward.
-        on_tool: whether the camera moves with the tool.
+        pose: pose of the camera, relative to the robot's base if ``on_tool`` is false, otherwise relative to the tool.
+            The camera's frame has x to the right of the image, y down and z forward.
+        on_tool: whether the camera is mounted on the tool and moves with it.
         nearest: smallest depth that is measured [m].
         farthest: largest depth that is measured [m].
         noise: noise of the depths; None: the depths are exact.
@@ -34,7 +34,8 @@ class DepthCamera:
         color: whether the images contain the colours of the simulated surfaces, without light and shade.
 
     Raises:
-        InputError: when an argument is of a wrong type, or the range of depths is empty or negative.
+        InputError: when an argument is of a wrong type, ``nearest`` is negative, or ``farthest`` is not above
+            ``nearest``.
     """
 
     def __init__(
@@ -65,7 +66,7 @@ class DepthCamera:
 
     @property
     def camera_to_base(self) -> Pose:
-        """The current pose of the camera."""
+        """The current pose of the camera in the robot's base frame."""
         return self.robot.tool_to_base @ self._pose if self._on_tool else self._pose
 
     def frame(self) -> DepthFrame:

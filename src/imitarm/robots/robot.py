@@ -22,7 +22,7 @@ _CHANGED = 1e-9  # relative change of a velocity above which a limit counts as h
 def limit_velocity(
     limits: JointLimits, q: ArrayLike, previous: ArrayLike, velocity: ArrayLike, dt: float
 ) -> tuple[Array, tuple[str, ...]]:
-    """Return the velocity nearest to ``velocity`` that the joints can reach, and from which they can brake in time.
+    """Limit a joint velocity so that the joints can reach it and can still brake before their position limits.
 
     First, all joints are slowed by one factor until none exceeds its maximum velocity, so that the tool keeps its
     direction. Then the velocity of each joint is clipped to the interval that
@@ -36,11 +36,11 @@ def limit_velocity(
         q: current commanded joint positions, shape (n_joints,) [rad].
         previous: joint velocity commanded last, shape (n_joints,) [rad/s].
         velocity: requested joint velocity, shape (n_joints,) [rad/s].
-        dt: time for which the velocity will be held [s].
+        dt: time until the joints reach the velocity [s].
 
     Returns:
-        The velocity, shape (n_joints,) [rad/s], and which of ``"velocity"``, ``"acceleration"`` and ``"position"``
-        changed it.
+        The permitted velocity, shape (n_joints,) [rad/s], and the names of the limits that changed it: any of
+        ``"velocity"``, ``"acceleration"`` and ``"position"``.
     """
     q, previous, requested = (np.asarray(x, dtype=float) for x in (q, previous, velocity))
     arm = limits.arm
@@ -56,16 +56,16 @@ def limit_velocity(
 class Robot(ABC):
     """A robot with an arm, simulated or real, that is commanded by joint velocities.
 
-    :meth:`move` limits a velocity and sends it. The integral of the sent velocities is ``set_point``, the joint
-    positions that the drives track. The limits therefore hold for the commands and do not depend on measurement
-    noise. Between two calls the acceleration is constant: the set-point moves by ``(previous + velocity) / 2 * dt``.
+    :meth:`move` limits a velocity and sends it to the robot. The drives track the joint positions ``set_point``, the
+    integral of the sent velocities. The limits are computed from ``set_point``, so measurement noise has no effect on
+    them. Between two calls the acceleration is constant: the set-point moves by ``(previous + velocity) / 2 * dt``.
 
     Attributes:
         arm: the model of the arm, with its limits.
         set_point: commanded joint positions, shape (n_joints,) [rad].
         velocity: commanded joint velocities, shape (n_joints,) [rad/s].
         clamped: limits that changed the last command: any of ``"velocity"``, ``"acceleration"``, ``"position"``.
-        fault: reason of a protective stop; empty if there was none.
+        fault: reason for the protective stop; empty if there was none.
     """
 
     following_error: ClassVar[float] = 0.1  # [rad] distance from its set-point at which a joint counts as blocked
@@ -94,10 +94,10 @@ class Robot(ABC):
     def move(self, velocity: ArrayLike, dt: float) -> ArmState:
         """Move for ``dt`` seconds; the joints reach ``velocity`` at the end.
 
-        A velocity beyond the limits is replaced by the nearest velocity within the limits (:func:`limit_velocity`), and
-        ``clamped`` names the limits that were exceeded. An invalid argument (wrong shape, NaN) stops the robot, then
-        raises InputError. A joint that is more than 0.1 rad away from its set-point counts as blocked: the robot makes
-        a protective stop, sets ``fault``, and no longer moves.
+        A velocity beyond the limits is replaced by a permitted velocity (:func:`limit_velocity`). Then ``clamped``
+        names the exceeded limits. If an argument is invalid (wrong shape, NaN), the robot stops before InputError is
+        raised. If a joint is more than 0.1 rad away from its set-point, the joint counts as blocked. The robot then
+        makes a protective stop, sets ``fault``, and no longer moves.
 
         Args:
             velocity: joint velocities, shape (n_joints,) [rad/s].
@@ -163,7 +163,7 @@ class Robot(ABC):
         return None
 
     def report(self) -> Mapping[str, Any]:
-        """Return further measurements since the robot was started, by name; empty by default."""
+        """Return further measurements by name, for example the contacts in a simulation; empty by default."""
         return {}
 
     def stop(self, dt: float = 0.01) -> ArmState:

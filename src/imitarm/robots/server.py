@@ -59,9 +59,9 @@ class Supervisor:
       ``following``. If no valid command arrives for 0.5 s, the status becomes ``stopped``.
     * ``fault``: the robot has made a protective stop. Only a restart of the process ends this status.
 
-    The first status is ``stopped``. Because every stop has a new challenge, a recorded ENABLE has no effect, and after
-    a restart of the client its user must enable the robot again. The client that enables the robot is its owner until
-    the next stop. Any client may stop the robot.
+    The first status is ``stopped``. The client that enables the robot is its owner until the next stop. Every stop has
+    a new challenge, so a copy of an old ENABLE message has no effect. After a restart of the client, its user must
+    enable the robot again. Any client may stop the robot.
 
     A command is valid if it passes the :class:`~imitarm.transmission.datagram_filter.DatagramFilter`, is for this arm,
     and is within the joints' position and velocity limits. The command must also be near the set-point: the difference
@@ -74,12 +74,12 @@ class Supervisor:
               e = q_c + \dot q_c\, s - q
 
     Here, k is the gain, a the maximum acceleration, and s the time for which the command is extrapolated. The factor f
-    depends on the age of the command; it is 1 for the first 30 ms, then decreases to 0 at 100 ms. :meth:`Robot.move
+    is 1 until the command is 30 ms old, and then decreases to 0 at 100 ms. :meth:`Robot.move
     <imitarm.robots.robot.Robot.move>` limits this velocity again. No sequence of datagrams can therefore move the
     set-point beyond the limits of position, velocity and acceleration.
 
-    The methods take the time as an argument and never wait; :class:`~imitarm.robots.server.RobotServer` adds sockets
-    and real time.
+    The methods of this class take the time as an argument and never wait. :class:`~imitarm.robots.server.RobotServer`
+    receives the datagrams and calls these methods in real time.
 
     Args:
         robot: robot to move.
@@ -92,8 +92,8 @@ class Supervisor:
         reason: why the robot is stopped or faulty.
         challenge: number that ENABLE must currently contain; 0 if the robot is not stopped.
         datagram_filter: checks the owner's commands.
-        dropped: number of commands that the supervisor ignored, for each reason; commands that the filter dropped are
-            not counted.
+        dropped: number of commands that the supervisor ignored, by reason. Commands dropped by ``datagram_filter`` are
+            not counted here.
     """
 
     def __init__(self, robot: Robot, dt: float, *, on_event: Callable[[str], None] | None = None) -> None:
@@ -198,7 +198,7 @@ class Supervisor:
 
         Args:
             now: time [ns].
-            periods: length of the step in control periods; more than one after missed periods.
+            periods: number of control periods that this step covers; more than one if the server has missed periods.
         """
         silence = 1e-9 * (now - self._received)
         if self.status in (RobotStatus.FOLLOWING, RobotStatus.SLOWING):
@@ -266,10 +266,10 @@ class RobotServer:
     """Receives commands, moves a robot at a fixed rate, and answers each request once per period.
 
     The server sends nothing without a request, and a :class:`~imitarm.robots.server.Supervisor` checks every datagram
-    that it receives. If the machine was too busy and periods were missed, the next step is lengthened by the missed
-    time, up to 20 ms in total, so that the robot keeps up with the commands. The joints keep their limits in a
-    longer step, because the permitted velocity is computed from the length of the step. Missed time beyond 20 ms is
-    skipped.
+    that it receives. If the machine is too busy and the server misses periods, the next step also covers the missed
+    time. The robot then keeps up with the commands. A step lasts at most 20 ms; the server skips the rest of the missed
+    time. The joints keep their limits in a longer step, because the permitted velocity is computed from the length of
+    the step.
 
     Args:
         robot: robot to serve.
@@ -280,13 +280,13 @@ class RobotServer:
             timestep.
         on_event: function called with a text when the robot is enabled, slows or stops.
         clock_ns: function that returns the time [ns].
-        wait: function that waits until a datagram arrives, at most for the given number of seconds, and returns whether
-            a datagram has arrived. With a simulated clock, this function advances the clock.
+        wait: function that takes a time [s], waits at most this long for a datagram, and returns whether one has
+            arrived. If the clock is simulated, the function must advance the clock.
 
     Attributes:
         address: host and port on which the server listens.
         supervisor: checks the commands and moves the robot.
-        rate_limiter: timer that starts the control periods and counts the missed ones.
+        rate_limiter: timer that starts the control periods and counts the missed periods.
 
     Raises:
         InputError: when the rate is out of range, or the port is in use.

@@ -50,10 +50,10 @@ class SimulatedRobot(Robot):
         model: the compiled world.
         data: state of the simulation; read only.
         scene_at_start: the scene at time 0.
-        contacts: names of the pairs that have touched since the last reset. A geom is a shape of the simulator. A pair
-            consists of a geom of the arm and an obstacle, a geom of the arm and a fixture, or two geoms of different
-            links of the arm (a self-contact).
-        contact_steps: number of physics steps with such a contact.
+        contacts: names of the pairs of geoms (shapes of the simulator) that have touched since the last reset. Each
+            pair contains a geom of the arm. The other geom belongs to an obstacle, a fixture, or another link (a
+            self-contact).
+        contact_steps: number of physics steps in which at least one such pair was in contact.
     """
 
     def __init__(
@@ -72,11 +72,12 @@ class SimulatedRobot(Robot):
         Args:
             arm: the arm with its tool.
             scene: scene whose obstacles and fixtures become solid bodies; None: no obstacles. The scene's ``stamp`` is
-                the start time of the world. Without fixtures and ``world``, a floor and a pedestal are added.
+                the start time of the world. If the scene has no fixtures and ``world`` is None, a floor and a pedestal
+                are added.
             motion: motions of some obstacles, by name or index. Each motion is a function of the time on the scene's
                 clock, or a recorded :class:`~imitarm.scene.motion.Track`. Other obstacles keep their velocities.
-            world: world with the arm, built by :func:`~imitarm.robots.world.arm_world`, to which furniture may have
-                been added; a copy is used. None: the world is built from the scene.
+            world: world with the arm, built by :func:`~imitarm.robots.world.arm_world`, possibly with added furniture;
+                the robot uses a copy of it. None: the world is built from the scene.
             control: ``"position"`` or ``"torque"``.
             q: start posture, shape (n_joints,) [rad]; None: ``arm.home``.
             timestep: time step of the physics and of the drives [s].
@@ -138,7 +139,7 @@ class SimulatedRobot(Robot):
         self._moving = isinstance(self._source, MovingScene) or any(obstacle.moves for obstacle in scene.obstacles)
 
     def reset(self, q: ArrayLike | None = None) -> ArmState:
-        """Return the world to time 0, with the arm at rest at ``q``.
+        """Reset the world to time 0, with the arm at rest at ``q``.
 
         Args:
             q: joint angles, shape (n_joints,) [rad]; None: the angles given to the constructor.
@@ -181,8 +182,8 @@ class SimulatedRobot(Robot):
     def grasp(self, opening: float) -> None:
         """Begin to move the fingers of a mounted gripper; see :meth:`~imitarm.robots.robot.Robot.grasp`.
 
-        The commanded opening changes at 0.12 m/s. The servo's force is its stiffness times the remaining distance,
-        limited to the force in its file. :meth:`reset` cancels the command.
+        The commanded opening changes at 0.12 m/s. The fingers' servo applies its stiffness times the remaining
+        distance, but at most the force given in the gripper's file. :meth:`reset` cancels the command.
         """
         self._drives.grasp(opening)
 
@@ -322,8 +323,9 @@ class Drives:
     """One drive for each joint; ``servo``, ``computed_torque`` and ``free`` each make one physics step.
 
     The set-point has the position ``q_d``, the velocity ``v_d`` and the acceleration ``a_d``. In the equations, ``M``
-    is the inertia matrix with the rotors, ``h`` the torques of gravity and Coriolis forces, and ``f`` the torques of
-    the joints' viscous and dry friction at ``v_d``. The rated torques are never exceeded.
+    is the inertia matrix, including the inertia of the drives' rotors. ``h`` are the torques of gravity and Coriolis
+    forces, and ``f`` the torques of the joints' viscous and dry friction at ``v_d``. The rated torques are never
+    exceeded.
 
     Args:
         model: the compiled world, with the drives that :func:`add_drives` has added.
@@ -426,7 +428,7 @@ class Drives:
         Args:
             force: force of the hand, in the base frame, shape (3,) [N].
             torque: torque of the hand, shape (3,) [N m].
-            site: id of the site.
+            site: id of the MuJoCo site at which the hand pulls.
         """
         m, d = self._model, self._data
         self._prepare(False)

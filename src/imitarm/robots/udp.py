@@ -31,9 +31,10 @@ class Echo(NamedTuple):
 
     Attributes:
         sequence: sequence number of the command.
-        sent: time from sending to receiving [s]. If the server is on another machine, the travel time of the fastest
-            command is subtracted.
-        applied: time from receiving the command until the drives received a set-point computed from this command [s].
+        sent: travel time of the command from this client to the server [s]. If the server is on another machine, the
+            travel time of the fastest command is subtracted.
+        applied: time from the command's arrival at the server until the drives received a set-point computed from it
+            [s].
         applied_ns: time at which this set-point was given to the drives, on the clock of this process [ns]. If the
             server is on another machine, the travel time of the fastest command is assumed to be 0.
     """
@@ -48,12 +49,12 @@ class UdpRobot(Robot):
     """The client of a :class:`~imitarm.robots.server.RobotServer`.
 
     :meth:`move` limits the velocity in the same way as for every other robot. It then sends the resulting set-point,
-    and the server checks the set-point again. The client sends commands only while the newest state from the server is
-    at most 0.1 s old and says that the robot follows this client. At all other times, the client sends no command and
-    adopts the server's set-point. Therefore the arm never jumps after a restart of the client or the server, or after
-    an interrupted connection.
+    and the server checks the set-point again. The client sends commands only if the newest state from the server is at
+    most 0.1 s old and says that the robot follows this client. Otherwise, the client sends no command and adopts the
+    server's set-point. Therefore the arm never jumps after a restart of client or server, or after an interrupted
+    connection.
 
-    A stopped robot moves again only after :meth:`enable`, which requires a decision by a person.
+    A stopped robot moves again only after :meth:`enable`. A person must decide to call :meth:`enable`.
 
     Args:
         arm: model of the arm that is served.
@@ -67,7 +68,7 @@ class UdpRobot(Robot):
         interruptions: number of times that the client has lost control of the robot, or had to adopt the server's
             set-point.
         sequence: sequence number of the last command; None before the first.
-        datagram_filter: checks the received states.
+        datagram_filter: drops states that are invalid, old or out of order.
 
     Raises:
         InputError: when the host does not exist, or its server controls another arm.
@@ -163,7 +164,7 @@ class UdpRobot(Robot):
         return float("nan") if self.reported.opening is None else self.reported.opening[1]
 
     def echoes(self) -> list[Echo]:
-        """Return the times of those commands that the server has reported since the last call of this method."""
+        """Return the times of the commands, as reported by the server since the last call of this method."""
         echoes, self._echoes = self._echoes, []
         return echoes
 
@@ -203,7 +204,7 @@ class UdpRobot(Robot):
         self.sequence = self._command(CommandMode.MOVE, q, velocity)
 
     def grasp(self, opening: float) -> None:
-        """Send an opening of the gripper with every command from now on.
+        """Set the opening of the gripper that every command from now on requests.
 
         Args:
             opening: distance between the fingers [m].
@@ -217,7 +218,7 @@ class UdpRobot(Robot):
         self._opening = float(opening)
 
     def stop(self, dt: float = 0.01) -> ArmState:
-        """Brake at the maximum acceleration, in real time, until the commanded velocity is zero.
+        """Brake at the maximum acceleration until the commanded velocity is zero; this takes real time.
 
         Args:
             dt: time between two commands [s].

@@ -60,10 +60,10 @@ def arm_world(
 
 
 def add_fixtures(spec: mujoco.MjSpec, fixtures: Sequence[Obstacle]) -> None:
-    """Add each fixture as a static geom of the same name; fixtures without a name become ``fixture/0`` and so on.
+    """Add each fixture as a static geom with the fixture's name, or ``fixture/i`` for a fixture i without a name.
 
     Args:
-        spec: world; changed in place. A fixture is not added when a geom of its name exists.
+        spec: world; changed in place. If the world already has a geom of the fixture's name, the fixture is not added.
         fixtures: fixtures in the base frame, which is the world frame.
     """
     there = {geom.name for geom in spec.geoms}
@@ -80,7 +80,9 @@ def fixture_names(fixtures: Sequence[Obstacle]) -> list[str]:
 
 
 def add_obstacles(spec: mujoco.MjSpec, scene: Scene) -> None:
-    """Add every obstacle of ``scene`` as a solid body; the body follows the obstacle's motion, not contact forces.
+    """Add every obstacle of ``scene`` as a solid body.
+
+    The body moves as the obstacle does; contact forces do not move it.
 
     Args:
         spec: world; changed in place.
@@ -141,9 +143,9 @@ def _surface(obstacle: Obstacle, n_around: int = 96, n_up: int = 32) -> Array:
 class ClearanceGauge:
     """Measures the smallest distance from an arm to obstacles and finds contacts, using the simulator's geoms.
 
-    Bounding spheres are evaluated first: the distance between their centres minus both radii is a lower bound for the
-    distance of a pair of geoms. Pairs are then measured by ``mj_geomDistance`` in the order of their bounds, until the
-    next bound exceeds the smallest measured distance. Most pairs therefore need no exact measurement.
+    For each pair of geoms, the distance between the bounding spheres is a lower bound of the pair's distance. The pairs
+    are measured by ``mj_geomDistance`` in the order of their lower bounds, until the next bound exceeds the smallest
+    measured distance. Most pairs therefore need no exact measurement.
 
     Args:
         model: the compiled world.
@@ -177,15 +179,18 @@ class ClearanceGauge:
         self._in_contact: tuple[bytes, set[tuple[int, int]]] = b"", set()  # geoms in contact, and what touching gives
 
     def ignore_present_self_contacts(self, data: mujoco.MjData) -> None:
-        """From now on, ignore contacts between links that touch now; in some files, neighbouring links overlap."""
+        """From now on, ignore contacts between links that touch now.
+
+        In some robot files, neighbouring links overlap.
+        """
         self._by_design = {(first, second) for _, first, second in self._self_contacts(data)}
         self._in_contact = b"", set()
 
     def measure(self, data: mujoco.MjData) -> tuple[float, tuple[int, int] | None]:
         """Return the smallest signed distance [m], negative in contact, and the ids of the two geoms.
 
-        For a self-contact, the distance is minus the depth of the contact. The result is inf and None without
-        obstacles, or if all obstacles are farther than 100 m.
+        For a self-contact, the distance is minus the depth of the contact. Without contact, and without an obstacle
+        within 100 m, the result is inf and None.
         """
         smallest, pair = _FAR, None
         for depth, first, second in self._self_contacts(data):
@@ -207,7 +212,8 @@ class ClearanceGauge:
     def touching(self, data: mujoco.MjData) -> set[tuple[int, int]]:
         """Return the pairs of geoms currently in contact.
 
-        The pairs are arm and obstacle, arm and fixture, or arm and arm (lower id first).
+        Each pair holds the ids of a geom of the arm and a geom of an obstacle or fixture, or of two geoms of the arm
+        (lower id first).
         """
         if not data.ncon:
             return set()

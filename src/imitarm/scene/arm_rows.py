@@ -1,7 +1,7 @@
 """Distances of an arm's spheres to obstacles and to each other, with their gradients, for the safety filter.
 
-If the compiled code has been built (:mod:`imitarm.compiled`), it computes these distances, otherwise NumPy. Both give
-the same numbers up to rounding.
+Compiled code (:mod:`imitarm.compiled`) computes these distances; if it has not been built, NumPy does. The results
+agree up to rounding errors.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ _MOST_JOINTS = 64  # MAX_JOINTS in arm_rows.c
 
 
 def has_kernels(arm: ArmModel) -> bool:
-    """Return whether compiled code is there, and has room for the joints of the arm."""
+    """Return whether compiled code has been built and supports the number of joints of the arm."""
     return library() is not None and arm.n_joints <= _MOST_JOINTS
 
 
 def numbers(values: ArrayLike, n: int, name: str) -> Array:
-    """Return ``n`` numbers in a contiguous array, as compiled code reads them.
+    """Return ``n`` numbers as a contiguous array of doubles, which compiled code can read.
 
     Raises:
         InputError: when there are more or fewer numbers.
@@ -48,13 +48,13 @@ def numbers(values: ArrayLike, n: int, name: str) -> Array:
 
 
 class NearRows(NamedTuple):
-    """Rows of a clearance limit, and the pair of a sphere and an obstacle to which each belongs.
+    """Inequalities of a clearance limit. Each row belongs to one pair of a sphere of the arm and an obstacle.
 
     Attributes:
         rows: inequalities on the joint velocity.
         obstacle: index of the obstacle, shape (k,).
         sphere: index of the sphere of the arm, shape (k,).
-        room: remaining distance h, shape (k,) [m].
+        room: distance of each pair minus its required clearance, shape (k,) [m].
     """
 
     rows: Rows
@@ -73,16 +73,16 @@ def compiled_near_rows(
     velocity: Array | None,
     box: Box,
 ) -> NearRows | None:
-    """Return the rows of ``ClearanceLimit``, computed by compiled code, which must exist; None if there is no row.
+    """Return the rows of ``ClearanceLimit``, computed by compiled code; None if there is no row.
 
-    The arrays must be those of :func:`numbers`.
+    The compiled code must have been built. Convert the arrays with :func:`numbers` before the call.
 
     Args:
         limit: the C structure ``Limit``.
         cover: spheres that cover the arm.
-        memory: the kinematics of the posture.
+        memory: kinematics of the arm, computed for its current posture.
         scene: obstacles predicted for the current time, with their velocities.
-        reach: for each sphere, the largest distance from its centre to an obstacle that has a row, shape (m,) [m].
+        reach: distance from each sphere's centre up to which an obstacle gets a row, shape (m,) [m].
         margins: distance added to the clearance of each obstacle, shape (n,) [m]; None: nothing is added.
         velocity: joint velocity, shape (n_joints,) [rad/s]; None: the arm is at rest.
         box: bounds of the joint velocity; rows that no velocity within these bounds violates are left out.
@@ -101,10 +101,10 @@ def compiled_near_rows(
 
 
 class OwnRows(NamedTuple):
-    """Pairs of two spheres of an arm that are near each other, nearest pair first.
+    """Pairs of spheres of an arm that are near each other, with the nearest pair first.
 
     Attributes:
-        pair: index of the pair, shape (k,).
+        pair: index of the pair in :class:`SpherePairs`, shape (k,).
         distance: distance of the two spheres, shape (k,) [m].
         gradient: derivatives of the distance with respect to the joints, shape (k, n_joints) [m/rad].
     """
@@ -117,9 +117,9 @@ class OwnRows(NamedTuple):
 class Nearness(NamedTuple):
     """Defines which pairs of spheres are near.
 
-    A pair is near if its distance is less than ``close``; if there are more than ``most`` such pairs, only the ``most``
-    closest pairs are near. In addition, the closest pair of each of the ``n_groups`` closest groups is near if its
-    distance is less than ``within``.
+    A pair is near if its distance is less than ``close``. If there are more than ``most`` such pairs, only the closest
+    ``most`` of them count as near. A group contains the pairs of the same two links. In addition, the closest pair of
+    each of the ``n_groups`` closest groups is near if its distance is less than ``within``.
 
     Attributes:
         n_groups: number of groups whose closest pair may be near.
@@ -135,7 +135,7 @@ class Nearness(NamedTuple):
 
 
 class Demand(NamedTuple):
-    """The inequality for each pair: its distance may shrink at most at the rate ``gain * (distance - clearance)``.
+    """Limit of the rate at which the distance of each pair may shrink: ``gain * (distance - clearance)`` [m/s].
 
     Attributes:
         clearance: required distance of each pair [m].
@@ -158,7 +158,7 @@ class SpherePairs:
         inner: index of the sphere nearer to the base, shape (k,); the spheres of the base are numbered after the
             spheres of the arm.
         sums: sum of the two radii, shape (k,) [m].
-        starts: first pair of each group, shape (g,).
+        starts: index of the first pair of each of the g groups, shape (g,).
     """
 
     cover: SphereCover
@@ -176,7 +176,7 @@ class SpherePairs:
         return Record(len(self.sums), len(self.starts), *arrays)
 
     def distances(self, centers: Array) -> Array:
-        """Return the distances of all pairs, shape (k,) [m]; ``centers`` (m, 3) [m] has the arm's centres."""
+        """Return the distances of all pairs, shape (k,) [m], for the centres (m, 3) [m] of the arm's spheres."""
         every = np.concatenate([centers, self.cover.base_centers])
         between = every.take(self.outer, axis=0) - every.take(self.inner, axis=0)
         between *= between
@@ -193,7 +193,7 @@ class SpherePairs:
             arm: the arm.
             q: joint positions, shape (n_joints,) [rad].
             nearness: definition of the near pairs.
-            demand: the inequality for each pair.
+            demand: limit of the rate at which each distance may shrink.
             box: bounds of the joint velocity; if no velocity within these bounds violates an inequality, the result may
                 be None.
         """

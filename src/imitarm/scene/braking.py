@@ -1,14 +1,14 @@
 r"""Rates at which the distance from an arm to an obstacle may shrink, so that the arm can still brake or yield.
 
-Let h be the remaining distance [m], and w the rate at which it shrinks [m/s]. A command takes effect after the delay T
-[s]. Then the joints reduce w evenly to zero within the time t [s], while the distance still shrinks. The remaining
-distance suffices if
+Let h be the distance that remains before the required clearance is reached [m], and w the rate at which it shrinks
+[m/s]. A command takes effect after the delay T [s]. Then the joints reduce w evenly to zero within the time t [s],
+while the distance still shrinks. The remaining distance suffices if
 
 .. math:: h \;\ge\; w\,T + \tfrac12 w\,t \qquad\Leftrightarrow\qquad w \;\le\; \frac{h}{T + t/2} .
 
-The function :func:`shrink_rates` returns 1 / (T + t/2), the factor of h. Both the safety filter
-(:class:`~imitarm.scene.clearance_limit.ClearanceLimit`) and the execution times of planned paths use this factor, so
-they agree.
+The function :func:`shrink_rates` returns the factor 1 / (T + t/2). The safety filter
+(:class:`~imitarm.scene.clearance_limit.ClearanceLimit`) uses this factor, and so does the timing of planned paths. The
+filter therefore does not slow down a planned motion.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from imitarm.kinematics.arm import ArmModel
 Array = NDArray[np.float64]
 
 APPROACH_RATE = 6.0
-"""A distance to an obstacle never shrinks by more than this fraction of itself per second [1/s]."""
+"""Upper limit of the rate at which a distance to an obstacle may shrink, divided by the distance itself [1/s]."""
 LONGEST_YIELD = 1.5
-"""Upper limit of the time t in which a part of the arm reaches the speed of an obstacle [s]."""
+"""Upper limit of the yielding time, in which a part of the arm reaches the speed of an obstacle [s]."""
 SHARE = 0.1
-"""Fraction of the acceleration that all joints together could give to a part of the arm; only this part is used."""
+"""Assumed acceleration of a yielding part of the arm, as a fraction of what all joints together could give it."""
 
 
 def shrink_rates(
@@ -37,7 +37,7 @@ def shrink_rates(
     most: float = APPROACH_RATE,
     delay: Array | float = 0.01,
 ) -> Array | float:
-    r"""Return the fraction of each distance by which it may shrink per second [1/s].
+    r"""Return the rate at which each distance may shrink, divided by the distance itself [1/s].
 
     The result is :math:`\min(\text{most},\, 1/(T + t/2))`. The time t [s] is the longer of two times:
 
@@ -45,10 +45,10 @@ def shrink_rates(
       q` to rest. :math:`a_j` is the acceleration limit of joint j.
     * The yielding time :math:`v_o / (0.1 \sum_j |g_j| a_j)`, at most 1.5 s, in which a part of the arm at rest reaches
       the speed :math:`v_o` of an approaching obstacle. Here, g is the gradient of the distance with respect to the
-      joints. The sum is the acceleration along the normal if every joint moved only this part. The formula uses only a
-      tenth of this sum, because other parts of the arm must yield at the same time, and the tool should keep its
-      position. If a part can't become as fast as the obstacle, the yielding time is 0, because an early start would not
-      help.
+      joint angles. The sum is the largest acceleration that the joints can give to this part of the arm, away from the
+      obstacle. The formula uses only a tenth of the sum, because the joints must move other parts of the arm at the
+      same time. If the part can't become as fast as the obstacle, yielding early would not help, and the yielding time
+      is 0.
 
     Args:
         arm: the arm, with its limits of velocity and acceleration.
