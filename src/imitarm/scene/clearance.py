@@ -33,30 +33,30 @@ _MOST_KNOWN = 64
 
 
 class SelfClearance:
-    r"""Keeps links that are not neighbours, and the tool, apart from each other.
+    r"""Keeps the links of an arm and its tool apart from each other; neighbouring links are not checked.
 
-    The arm is covered by spheres (``ArmModel.collision_spheres``). For the spheres i and j of two links, with centres
-    c and radii r, the following formulas give the distance :math:`d` and its gradient:
+    The arm is covered by spheres (``ArmModel.collision_spheres``). Let spheres i and j of two links have the centres c,
+    the radii r and the Jacobians J. Their distance :math:`d` and its gradient are
 
     .. math:: d = |c_i - c_j| - r_i - r_j, \qquad \nabla d = n^T (J_i - J_j), \quad n = (c_i - c_j)/|c_i - c_j|
 
-    Let v be the joint velocity. A row, which is the inequality :math:`\nabla d\, v \ge -\xi (d - d_{safe})`, lets the
-    distance shrink no faster than exponentially towards the required clearance :math:`d_{safe}`. If the distance is
-    below the clearance, the distance must grow, and 25/s replaces :math:`\xi` in the row. A pair of spheres has a row
-    if its distance is less than the clearance plus 6 cm; only the 64 nearest pairs count. In addition, a pair of links
-    has one row, for its nearest pair of spheres, if the links are less than 15 cm apart; only the ``n_rows`` nearest
-    pairs of links count.
+    Let v be the joint velocity. Each row is the inequality :math:`\nabla d\, v \ge -\xi (d - d_{safe})` for one pair of
+    spheres. It lets the distance shrink at most exponentially towards the required clearance :math:`d_{safe}`. If the
+    distance is below the clearance, it must grow, and 25/s replaces :math:`\xi`. The 64 nearest pairs of spheres have a
+    row if their distance is less than the clearance plus 6 cm. In addition, each of the ``n_rows`` nearest pairs of
+    links has a row for its nearest spheres, if these are closer than the clearance plus 15 cm.
 
-    Three kinds of pairs are not checked. The first kind are links that share a joint. The second are links that can't
-    touch within their joint limits (:func:`meeting_links`). The third are pairs of spheres that are nearer to each
-    other than the clearance when the arm is in its home posture. The base is included in the check. The object on which
-    the base stands is not part of the arm; add this object to the scene.
+    Three kinds of pairs are not checked. The first are links that share a joint. The second are links that can't touch
+    within their joint limits (:func:`meeting_links`). The third are spheres that are closer to each other than the
+    clearance in the arm's home posture. The base counts as a link. The object on which the base stands is not part of
+    the arm; add this object to the scene.
 
     Args:
         arm: the arm with its tool.
         clearance: required distance between links [m].
         n_rows: largest number of pairs of links that have a row.
-        gain: :math:`\xi`, the largest fraction of the remaining distance that may vanish per second [1/s].
+        gain: :math:`\xi`, the largest rate at which the distance may shrink, divided by the distance minus the
+            clearance [1/s].
 
     Raises:
         InputError: when a number can't be used.
@@ -91,13 +91,13 @@ class SelfClearance:
         return len(self.pairs.sums)
 
     def distance(self, q: ArrayLike) -> float:
-        """Return the smallest distance of all checked pairs of spheres [m]; negative when two overlap.
+        """Return the smallest distance of all checked pairs of spheres [m]; negative if two spheres overlap.
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
 
         Returns:
-            The distance [m]; inf if no two links of the arm could touch.
+            The distance [m]; inf if no pair of spheres is checked.
         """
         if not self.n_pairs:
             return math.inf
@@ -119,11 +119,11 @@ class SelfClearance:
         return pairs, found.distance
 
     def names_of(self, q: ArrayLike, row: int) -> tuple[str, str, float]:
-        """Return the names of the two links of a row of :meth:`rows`, and their distance minus the clearance [m].
+        """Return the names of the two links to which a row belongs, and their distance minus the clearance [m].
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
-            row: index of the row.
+            row: index of the row in the result of :meth:`rows`.
         """
         pairs, distances = self.nearest(q)
         bodies = self.arm.cover.bodies
@@ -131,7 +131,7 @@ class SelfClearance:
         return first, second, float(distances[row]) - self.clearance
 
     def rows(self, q: ArrayLike, box: Box | None = None) -> Rows | None:
-        """Return inequalities on the joint velocity for ``solve_ik(..., rows=...)``.
+        """Return inequalities on the joint velocity, which can be passed to ``solve_ik(..., rows=...)``.
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
@@ -161,13 +161,13 @@ class SelfClearance:
         return None if found is None else (found.gradient, found.distance - self.clearance)
 
     def lower(self, room: Array) -> Array:
-        """Return the least allowed rates (k,) [m/s] of distances; ``room`` (k,) [m] is distance minus clearance."""
+        """Return the lowest allowed rates of distances (k,) [m/s]; ``room`` (k,) [m] is distance minus clearance."""
         if min(room.tolist(), default=0.0) >= 0.0:  # nearly always
             return -self._gain * room
         return np.where(room < 0.0, -_RETREAT_RATE, -self._gain) * room
 
     def periodic(self, dt: float = 0.01) -> PeriodicSelfClearance:
-        """Return a version of this check for a control loop with period ``dt`` [s]; it takes a fifth of the time."""
+        """Return a version of this check that is five times as fast, for a control loop with period ``dt`` [s]."""
         return PeriodicSelfClearance(self, dt)
 
     def _found(self, q: ArrayLike, box: Box | None = None) -> OwnRows | None:
@@ -178,9 +178,9 @@ class SelfClearance:
 class PeriodicSelfClearance:
     r"""Rows of a :class:`SelfClearance` for a fast control loop: near pairs are searched for only every 30 to 50 ms.
 
-    Between two searches, the distances follow from the joints' motion, :math:`d(q) \approx d_0 + \nabla d\,(q - q_0)`.
-    If every joint moves at 1 rad/s, the error of this approximation stays below 8 mm for 50 ms. The error grows with
-    the square of the speed.
+    Between two searches, the distances are approximated by :math:`d(q) \approx d_0 + \nabla d\,(q - q_0)`, where
+    :math:`d_0` and :math:`q_0` are distances and joint positions at the last search. After 50 ms with every joint at 1
+    rad/s, the error is below 8 mm. The error grows with the square of the speed.
 
     Args:
         own: the self-clearance check whose rows are approximated.
@@ -193,7 +193,7 @@ class PeriodicSelfClearance:
         self.reset()
 
     def reset(self) -> None:
-        """Make the next step search for near pairs again."""
+        """Make the next call of :meth:`rows` search for near pairs again."""
         self._age = self._latest
         self._found: tuple[Array, Array] | None = None
         self._at: Array = np.zeros(0)
@@ -203,8 +203,7 @@ class PeriodicSelfClearance:
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
-            may_search: whether this step has time for a search. If a search is overdue, it takes place even if this is
-                False.
+            may_search: whether this step has time for a search. A search that is overdue takes place in any case.
         """
         self._age += 1
         if self._age > self._latest or (may_search and self._age > self._every):
@@ -219,17 +218,17 @@ class PeriodicSelfClearance:
 def meeting_links(arm: ArmModel) -> NDArray[np.bool_]:
     """Return, for every pair of links, whether the two links can touch within the limits of the joints between them.
 
-    Link 0 is the base; k joints move link k. For neighbouring links, the answer is always False. For links with two or
-    three joints between them, the distance of their exact shapes is measured in 512 postures, which fill the ranges of
-    these joints evenly (a Sobol sequence). If the links touch in none of these postures, the answer is False. For links
-    with four or more joints between them, the answer is always True.
+    Link 0 is the base, and link k is moved by the first k joints. For neighbouring links, the answer is always False.
+    For links with two or three joints between them, the distance of their exact shapes is measured in 512 postures,
+    which fill the ranges of these joints evenly (a Sobol sequence). If the links touch in none of these postures, the
+    answer is False. For links with four or more joints between them, the answer is always True.
 
     Args:
         arm: the arm with its tool.
 
     Returns:
-        A read-only array of shape (n_joints + 1, n_joints + 1). The answer for two links is at [outer, inner] with
-        outer > inner; all other entries are False.
+        A read-only array of shape (n_joints + 1, n_joints + 1). The entry [i, j] is the answer for links i and j with i
+        > j; all other entries are False.
     """
     model = arm.spec().compile()
     content = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)

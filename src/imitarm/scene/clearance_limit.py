@@ -28,34 +28,34 @@ _UNMOVED = 1e-6  # [m/rad] a joint that changes a distance by less does not chan
 class ClearanceLimit:
     r"""Inequalities on the joint velocity that keep a clearance between every link (and the tool) and every obstacle.
 
-    Spheres cover the arm and its tool (``ArmModel.collision_spheres``). Let ``c`` and ``r`` be the centre and the
-    radius of a sphere near an obstacle with the signed distance ``sd`` and the outward normal ``n``. The remaining
-    distance is ``h = sd(c) - r - clearance``. Let ``v_o`` be the velocity of the obstacle's nearest point. The row for
-    this sphere is the following inequality on :math:`\dot q`:
+    Spheres cover the arm and its tool (``ArmModel.collision_spheres``). Let ``c`` be the centre and ``r`` the radius of
+    a sphere near an obstacle. The obstacle has the signed distance ``sd(c)`` from the centre, and its outward normal is
+    ``n``. The remaining distance is ``h = sd(c) - r - clearance``. Let ``v_o`` be the velocity of the obstacle's
+    nearest point. The row for this sphere is the following inequality on :math:`\dot q`:
 
     .. math:: n^T J(q)\, \dot q \;\ge\; n^T v_o - k h, \qquad k = \min\Big(\xi,\; \frac1{T + t/2}\Big)
 
-    The row lets h shrink at most exponentially, and so slowly that the arm can still brake or yield to the obstacle
-    before h is 0. Here, t is the time that braking or yielding takes, and T is the delay of the commands
-    (:func:`~imitarm.scene.braking.shrink_rates`). For obstacles at rest, k is nearly always :math:`\xi`. If an obstacle
-    is fast, or if the joints can accelerate a link only slowly, k is smaller, so the arm yields earlier. In theory h
-    stays positive. In practice h can become negative, because links move on arcs and control steps are finite. While h
-    is negative, ``retreat_rate`` replaces k, and h must grow.
+    J is the Jacobian of the centre. The row lets h shrink at most exponentially, and so slowly that the arm can brake
+    or yield to the obstacle before h is 0. Braking or yielding takes the time t, and commands take effect after the
+    delay T (:func:`~imitarm.scene.braking.shrink_rates`). For obstacles at rest, k is nearly always :math:`\xi`. If an
+    obstacle is fast, or if the joints can accelerate a link only slowly, k is smaller, so the arm yields earlier.
+    Because links move on arcs and control steps are finite, h can become slightly negative. Then ``retreat_rate``
+    replaces k, and h must grow.
 
-    Every sphere within ``influence`` of an obstacle has a row, unless no velocity within the limits of the joints can
-    violate this row. The spheres contain the shapes that they cover, so the true distance is never smaller than the
-    distance of the spheres.
+    Every sphere whose h is at most ``influence`` has a row. Rows that no permitted joint velocity can violate are left
+    out. The spheres contain the shapes that they cover, so the true distance is never smaller than the distance of the
+    spheres.
 
     Args:
         arm: arm with its tool.
         clearance: required distance of every link to every obstacle [m].
-        rate: :math:`\xi`; while h is positive, h may shrink by at most this fraction of itself per second [1/s].
+        rate: :math:`\xi`, the largest rate at which a positive h may shrink, divided by h [1/s].
         influence: a sphere has no row if its h is larger than this [m]. If obstacles move, the influence is extended by
             0.75 s times the speed of the fastest obstacle.
-        retreat_rate: while h is negative, h must grow by at least this fraction of its magnitude per second [1/s].
-        delay: T, the control period plus the latency of the arm [s]; the age of each obstacle is added.
-        deviations: if an obstacle has a covariance, this many standard deviations of its position along the normal are
-            subtracted from its distance.
+        retreat_rate: smallest rate at which a negative h must grow, divided by the magnitude of h [1/s].
+        delay: T, the control period plus the latency of the arm [s]. The time since each obstacle was seen is added.
+        deviations: number of standard deviations of an obstacle's position along the normal to subtract from its
+            distance, if the obstacle has a covariance.
 
     Raises:
         InputError: when ``arm`` is not an ArmModel, or a number is not finite or is negative.
@@ -95,7 +95,7 @@ class ClearanceLimit:
 
         Returns:
             One row for each pair of a sphere and an obstacle within ``influence``; None when there is no pair. A pair
-            that is too close has no row if no joint can change its distance.
+            with a negative h has no row if no joint can change its distance.
 
         Raises:
             InputError: when ``q`` is not n_joints finite numbers, or ``velocity`` is not n_joints numbers.
@@ -111,7 +111,7 @@ class ClearanceLimit:
         margins: Array | None = None,
         box: Box | None = None,
     ) -> NearRows | None:
-        """Return the inequalities and the pairs to which they belong; the errors are those of :meth:`rows`.
+        """Return the inequalities and the pairs to which they belong; raise the same errors as :meth:`rows`.
 
         Args:
             q: joint positions, shape (n_joints,) [rad].

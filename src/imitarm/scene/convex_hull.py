@@ -23,12 +23,11 @@ _SAME_PLANE = 1e-12  # neighbouring triangles belong to one face when the cosine
 
 @dataclass(frozen=True)
 class Polytope:
-    """Faces and edges of a hull in its local frame; they stay valid when the hull moves.
+    """Faces and edges of a convex hull in its local frame, which moves with the hull.
 
     If ``n_i.x = b_i`` are the planes of the faces, the distance inside is ``sd = max_i (n_i.x - b_i)``. Outside, this
-    maximum is a lower bound of the distance. The bound is exact if the foot point ``x - sd n_i`` is on the face;
-    otherwise the nearest surface point is on an edge or at a corner, and the distance is the smallest distance to an
-    edge.
+    maximum is a lower bound of the distance. The bound is exact if the foot point ``x - sd n_i`` is on the face.
+    Otherwise, the distance is the smallest distance to an edge.
 
     Attributes:
         vertices: corners of the hull, shape (v, 3) [m].
@@ -40,7 +39,7 @@ class Polytope:
         starts: one end of each edge between two faces, shape (3, e) [m].
         directions: unit vectors along the edges, shape (3, e).
         lengths: lengths of the edges, shape (e,) [m].
-        starts_along: ``starts·directions`` of each edge, shape (e,) [m].
+        starts_along: scalar product of each edge's start and direction, shape (e,) [m].
         starts_twice: ``-2 starts``, shape (3, e) [m].
         starts_squared: ``|starts|²``, shape (e,) [m²].
     """
@@ -64,7 +63,7 @@ class Polytope:
 
     @classmethod
     def around(cls, points: Array) -> Polytope:
-        """Build the hull of points (n, 3) whose mean is the origin and which span a volume."""
+        """Build the hull of points (n, 3) [m]. Their mean must be the origin, and they must not lie in one plane."""
         from scipy.spatial import ConvexHull as Qhull  # noqa: PLC0415  slow to import, and few scenes need it
 
         hull = Qhull(points)
@@ -95,7 +94,7 @@ class Polytope:
         )
 
     def formula(self, q: Array, gradient: bool) -> tuple[Array, Array | None]:
-        """Return distances and normals; arguments and results are those of :class:`~imitarm.scene.obstacle.Family`."""
+        """Return distances and normals, as the formula of a :class:`~imitarm.scene.obstacle.Family` does."""
         distance, rows = self.distance_and_normal(np.ascontiguousarray(q.reshape(3, -1).T))
         return distance.reshape(q.shape[1:]), rows.T.reshape(q.shape) if gradient else None
 

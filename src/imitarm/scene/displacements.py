@@ -17,7 +17,7 @@ Indices = NDArray[np.intp]
 def displaced_distances(
     packed: PackedObstacles, members: Indices, times: Array, origins: Array, scales: Array, directions: Array
 ) -> Array:
-    """Return the distances of groups of points; each group has its own obstacle and its own time.
+    """Return the distances of points to obstacles. The points form groups, each with its own obstacle and time.
 
     The points of group k are ``origins[k] + scales[k] directions[j]``. The arguments are not checked, to save time in
     control steps.
@@ -27,11 +27,11 @@ def displaced_distances(
         members: index of the obstacle of each group, shape (k,).
         times: time of each group, after the obstacles' reference time, shape (k,) [s].
         origins: origin of each group in the base frame, shape (k, 3) [m].
-        scales: shape (k,) [m].
+        scales: length by which the directions are multiplied in each group, shape (k,) [m].
         directions: vectors of any length, shape (m, 3).
 
     Returns:
-        Shape (k, m) [m], negative inside.
+        Signed distances, shape (k, m) [m], negative inside the obstacle.
     """
     families, place = packed._sorted[1], packed._place_of[members]
     to_local, q = _local(packed, members, place, times, origins)

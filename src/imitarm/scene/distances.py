@@ -42,7 +42,7 @@ _OF_THE_POSE = frozenset(("positions", "_frames", "_ahead", "_shapes", "_record"
 
 
 class Members(NamedTuple):
-    """Those obstacles of a ``PackedObstacles`` that share a distance formula."""
+    """The obstacles of a ``PackedObstacles`` that have the same distance formula."""
 
     formula: Formula
     places: slice  # in the order of ``PackedObstacles._sorted``
@@ -61,7 +61,7 @@ class _Frames(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PackedObstacles:
-    """Obstacles as arrays with one row each, at one time. :attr:`Scene.packed` builds them.
+    """Obstacles of a scene as arrays, one row for each obstacle; :attr:`Scene.packed` builds them.
 
     Attributes:
         kinds: index of each shape in :data:`KINDS`, shape (n,).
@@ -91,7 +91,7 @@ class PackedObstacles:
 
     @classmethod
     def of(cls, obstacles: Sequence[Obstacle], stamp: float) -> PackedObstacles:
-        """Stack ``obstacles``; ``stamp`` [s] is the time at which they have these poses."""
+        """Store ``obstacles`` as arrays; ``stamp`` [s] is the time at which the obstacles have their poses."""
         n, zero = len(obstacles), np.zeros((3, 3))
         solids = [obstacle.solid() for obstacle in obstacles]
         return cls(
@@ -128,10 +128,11 @@ class PackedObstacles:
         stamp: float | Array,
         covariances: Array | None = None,
     ) -> PackedObstacles:
-        """Return the same shapes with other poses; ``stamp`` [s] is one time, or one time for each obstacle (n,).
+        """Return the same obstacles at other poses.
 
-        Each of the other arguments is the new value of the attribute with the same name; without ``covariances``, the
-        covariances are kept.
+        ``stamp`` [s] is the time at which the obstacles were seen: one number, or one for each obstacle, shape (n,).
+        The other arguments replace the attributes of the same names; if ``covariances`` is None, the covariances are
+        kept.
         """
         moved = self.copy(
             positions=positions,
@@ -253,12 +254,12 @@ class PackedObstacles:
 
 
 def distances(packed: PackedObstacles, points: ArrayLike, times: ArrayLike | None = None) -> Array:
-    """Return the signed distance of every point to every obstacle, at one time or at several.
+    """Return the signed distance of every point to every obstacle, at one time or at several times.
 
     Args:
         packed: n obstacles at their reference time.
-        points: points in the base frame, shape (..., 3) [m]. If ``times`` is given, the points at each time, shape (k,
-            ..., 3), or shape (1, ..., 3) for points that do not move.
+        points: points in the base frame, shape (..., 3) [m]. If ``times`` is given, the shape is (k, ..., 3) for points
+            that move, or (1, ..., 3) for points at rest.
         times: times counted from the obstacles' reference time, shape (k,) [s]; None: only the reference time.
 
     Returns:
@@ -291,7 +292,7 @@ class NearPairs(NamedTuple):
     Attributes:
         obstacle: index of the obstacle, shape (k,).
         point: index of the point, shape (k,).
-        distance: signed distance of the two, shape (k,) [m].
+        distance: signed distance of the point from the obstacle, shape (k,) [m].
         normal: gradient of the distance with respect to the point, in the base frame, one row for each axis, shape
             (3, k).
     """
@@ -310,7 +311,8 @@ def near_pairs(packed: PackedObstacles, points: Array, reach: Array) -> NearPair
     Args:
         packed: n obstacles.
         points: finite points in the base frame, shape (m, 3) [m].
-        reach: largest distance for each point, shape (m,) [m]; passing the same array in every call saves time.
+        reach: largest distance up to which a point forms a pair, shape (m,) [m]. If successive calls pass the same
+            array object, they take less time.
     """
     frames, m = packed._frames, len(points)
     if frames.upright:
@@ -401,12 +403,12 @@ def _at_once(packed: PackedObstacles, points: Array, times: Array | None, gradie
 
 
 def every(parameters: Parameters | list[Array | None]) -> list[Array | None]:
-    """Return the parameters of all obstacles of a family, with a last axis of length 1, to combine them with points."""
+    """Append an axis of length 1 to each parameter of a family, so that the parameters broadcast against points."""
     return [None if p is None else p[..., None] for p in parameters]
 
 
 def take(parameters: Parameters, members: Indices) -> list[Array | None]:
-    """Return the parameters of one obstacle of a family for each point; ``members`` are the obstacles' indices."""
+    """Return the family's parameters for each point, where ``members`` are the points' obstacles in the family."""
     return [None if p is None else p.take(members, axis=-1) for p in parameters]
 
 

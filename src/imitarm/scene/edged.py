@@ -34,17 +34,17 @@ def slabs(
 ) -> tuple[Array, Array | None]:
     """Return distances to boxes, cylinders and half-spaces, all as rounded boxes of half size ``half``.
 
-    With ``a = |q| - half`` the distance is ``|max(a, 0)| + min(max_j a_j, 0) - rounding``. A half-space is a box of
-    infinite size. A cylinder (``turned``) is a box in the coordinates ``(rho, z)`` with ``rho^2 = x^2 + y^2``. If a
-    scene contains boxes, cylinders or half-spaces, this function also computes its spheres, as rounded points, and its
-    capsules, as rounded segments.
+    With ``a = |q| - half`` the distance is ``|max(a, 0)| + min(max_j a_j, 0) - rounding``. A half-space is a very large
+    box. A cylinder (``turned``) is a box in the coordinates ``(rho, z)`` with ``rho^2 = x^2 + y^2``. If a scene
+    contains boxes, cylinders or half-spaces, this function also handles the scene's spheres (as rounded points) and
+    capsules (as rounded segments).
 
     Args:
         q: points in the local frames, shape (3, ...) [m].
         gradient: whether to return the normals too.
         half: half edge lengths, shape (3, ...) [m].
         rounding: radius of the rounding, shape (...) [m]; None: 0.
-        turned: whether each shape is a cylinder, shape (...); None: no cylinders.
+        turned: whether each shape is a cylinder, shape (...); None if there are no cylinders.
     """
     a = np.abs(q)
     if turned is not None:
@@ -99,7 +99,10 @@ SLABS = Family(("box", "cylinder", "half_space"), slabs, _prepare_slabs)
 
 @dataclass(frozen=True, eq=False)
 class Box(PosedObstacle):
-    """A cuboid: with ``a = |R^T (x - c)| - size/2`` the distance is ``sd = |max(a, 0)| + min(max_j a_j, 0)``.
+    """A cuboid.
+
+    Let R be the rotation and c the position of ``pose``. With ``a = |R^T (x - c)| - size/2``, the distance of a point x
+    is ``sd = |max(a, 0)| + min(max_j a_j, 0)``.
 
     Attributes:
         pose: obstacle_to_base, at the centre.
@@ -118,7 +121,10 @@ class Box(PosedObstacle):
 
 @dataclass(frozen=True, eq=False)
 class Cylinder(PosedObstacle):
-    """A flat-ended cylinder: the formula of :class:`Box` with ``a = (rho - radius, |z| - length/2)``.
+    """A cylinder with flat ends.
+
+    Let rho be the distance of a point from the axis, and z its coordinate along the axis. The signed distance is that
+    of :class:`Box` with ``a = (rho - radius, |z| - length/2)``.
 
     Attributes:
         pose: obstacle_to_base, at the middle of the cylinder's axis, with z along this axis.
@@ -151,7 +157,7 @@ def _rim(v: Array, radius: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class HalfSpace(Obstacle):
-    """Everything below a plane, such as a floor or a large table: ``sd(x) = n.(x - p)``.
+    """Everything on one side of a plane, such as a floor or a large table: ``sd(x) = n.(x - p)``.
 
     Attributes:
         point: any point ``p`` of the plane, in the base frame, shape (3,) [m].
@@ -182,7 +188,10 @@ class HalfSpace(Obstacle):
         raise InputError(f"{self._label}: a half-space is infinite and has no farthest point")
 
     def bounds(self) -> Array:
-        """Return bounds (2, 3) [m], infinite unless the plane is perpendicular to an axis of the base frame."""
+        """Return bounds (2, 3) [m].
+
+        A bound is finite only if the plane is perpendicular to an axis of the base frame.
+        """
         low, high = np.full(3, -np.inf), np.full(3, np.inf)
         for axis in np.flatnonzero(np.abs(self.normal) > 1.0 - 1e-12):
             (high if self.normal[axis] > 0.0 else low)[axis] = self.point[axis]
@@ -249,9 +258,9 @@ CONES = Family(("cone",), cones, _prepare_cones)
 class Cone(PosedObstacle):
     """A circular cone whose tip points along its local z axis.
 
-    In the half-plane ``(rho, z)``, the cone is a triangle. Outside, the distance is the smaller of the distances to the
-    slant side and to the base, which are segments. Inside, the distance is the larger of the signed distances to the
-    lines through these segments.
+    Let rho be the distance of a point from the axis. In the half-plane ``(rho, z)``, the cone is a triangle. Outside,
+    the distance is the smaller of the distances to two segments: the slant side and the base. Inside, the distance is
+    the larger of the signed distances to the lines through these segments.
 
     Attributes:
         pose: obstacle_to_base. The origin is on the axis at half the height, so the base is at ``z = -height/2`` and

@@ -32,7 +32,9 @@ _STEP = 1e-4  # [s] half of the interval over which velocities are differences
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A recorded motion, interpolated between its samples; before the first and after the last, the obstacle rests.
+    """A recorded motion, interpolated between its samples.
+
+    Before the first and after the last sample, the obstacle rests.
 
     Attributes:
         times: strictly increasing times of the samples, shape (n,) [s].
@@ -59,7 +61,7 @@ class Track:
             object.__setattr__(self, "quaternions", checked_unit_quaternions(quaternions, "Track"))
 
     def __call__(self, time: float) -> Pose | Array:
-        """Return the pose, or the position of a track without rotations, at ``time`` [s]."""
+        """Return the pose at ``time`` [s], or the position (3,) [m] if the track has no rotations."""
         position = np.array([np.interp(time, self.times, column) for column in self.positions.T])
         if self.quaternions is None:
             return position
@@ -71,8 +73,8 @@ class MovingScene:
     """A scene in which some obstacles follow functions of time; all other obstacles keep their velocity.
 
     Attributes:
-        scene: all obstacles at ``scene.stamp``; obstacles without a motion start from these poses.
-        motions: the motion of some obstacles, by index or by name.
+        scene: all obstacles, with their poses at the time ``scene.stamp``.
+        motions: functions of time that give the poses of some obstacles, by the obstacle's index or name.
 
     Raises:
         InputError: when an obstacle with a motion is not in the scene, or a motion does not return a pose or a
@@ -103,7 +105,7 @@ class MovingScene:
             self.at(self.scene.stamp)
 
     def from_stamp(self) -> MovingScene:
-        """Return this scene with its motions on another clock, which is 0 at the stamp of the scene."""
+        """Return the same scene and motions on a clock that starts with 0 at the scene's stamp."""
         begins = self.scene.stamp
         if begins == 0.0:
             return self

@@ -97,13 +97,14 @@ def rotation_from_z(axis: Array) -> Array:
 
 
 class Solid(NamedTuple):
-    """The geometry of one obstacle, in the form that the distance formulas need.
+    """The shape, size and pose of one obstacle, in the form that the distance formulas need.
 
     Attributes:
         kind: one of :data:`~imitarm.scene.distances.KINDS`.
         position: origin of the obstacle's local frame in the base frame, shape (3,) [m].
         quaternion: local_to_base rotation wxyz, shape (4,).
-        size: see :class:`~imitarm.scene.distances.PackedObstacles`, shape (3,) [m].
+        size: three lengths [m] whose meaning depends on ``kind``, see
+            :class:`~imitarm.scene.distances.PackedObstacles`.
         polytope: faces and edges of a convex hull in its local frame; None for other kinds.
     """
 
@@ -185,7 +186,7 @@ class Obstacle(ABC):
     ``x``; inside, it points from ``x`` to the nearest surface point; on the surface, it is the outward normal. Because
     the solids are convex, ``sd`` is convex. Between two points, ``sd`` changes by at most the distance between the
     points. The nearest surface point may not be unique, for example at the centre of a sphere. The gradient then refers
-    to one of the nearest points; the same input always gives the same point. To keep a distance ``r`` from an obstacle,
+    to one of the nearest points, always to the same one for the same ``x``. To keep a distance ``r`` from an obstacle,
     require ``sd(x) >= r``; no inflated copy of the obstacle is needed.
 
     Attributes:
@@ -290,10 +291,10 @@ class Obstacle(ABC):
         return _distance(self._single, finite_points(points), True)
 
     def distances_at(self, points: Array, gradient: bool) -> tuple[Array, Any]:
-        """Return distances, and gradients on request, without the check that all points are finite, to save time.
+        """Return distances and, if ``gradient`` is true, gradients; to save time, the points are not checked.
 
         Args:
-            points: float64 points in the base frame, shape (..., 3) [m].
+            points: finite float64 points in the base frame, shape (..., 3) [m].
             gradient: whether to compute gradients.
 
         Returns:
@@ -317,7 +318,7 @@ class Obstacle(ABC):
         return self._support(v.reshape(-1, 3)).reshape(v.shape)
 
     def bounds(self) -> Array:
-        """Return the lowest and the highest corner of the box along the base frame's axes, shape (2, 3) [m]."""
+        """Return the lowest and the highest corner of the bounding box along the base's axes, shape (2, 3) [m]."""
         axes = np.eye(3)
         return np.stack([np.diagonal(self.support(-axes)), np.diagonal(self.support(axes))])
 
@@ -348,15 +349,13 @@ class Obstacle(ABC):
         return moved
 
     def placed(self, position: Array, quaternion: Array, velocity: Array, angular_velocity: Array) -> Self:
-        """Return a copy of the obstacle with another pose, or the obstacle itself if the pose is the same.
-
-        The arguments must be valid.
+        """Return a copy of the obstacle with another pose and velocity, without checks of the arguments.
 
         Args:
             position: position of the local frame's origin, see :class:`~imitarm.scene.distances.PackedObstacles`, shape
                 (3,) [m].
             quaternion: local_to_base rotation wxyz, shape (4,).
-            velocity: velocity of the obstacle, shape (3,) [m/s].
+            velocity: velocity of the copy, shape (3,) [m/s].
             angular_velocity: angular velocity of the copy, shape (3,) [rad/s].
         """
         before = self.solid()
@@ -379,7 +378,7 @@ class Obstacle(ABC):
 
     @abstractmethod
     def solid(self) -> Solid:
-        """Return the geometry as :mod:`~imitarm.scene.distances` needs it."""
+        """Return the shape, size and pose in the form that :mod:`~imitarm.scene.distances` needs."""
 
     @abstractmethod
     def _support(self, directions: Array) -> Array:
@@ -392,7 +391,7 @@ class Obstacle(ABC):
 
 @dataclass(frozen=True, eq=False)
 class PosedObstacle(Obstacle):
-    """An obstacle whose shape is described in a local frame at its centre.
+    """An obstacle with a pose: its local frame is at the centre of its shape.
 
     Attributes:
         pose: obstacle_to_base: the centre and the rotation.

@@ -19,7 +19,7 @@ RECORD_WORDS = 11
 
 
 def record_of(packed: PackedObstacles) -> tuple[Record, float]:
-    """Return the C structure ``Obstacles``, and the time [s] from its poses to those of ``packed``."""
+    """Return the C structure ``Obstacles``, and the time [s] by which ``packed`` is later than its poses."""
     known: tuple[Record, float] | None = packed.__dict__.get("_record")
     if known is None:
         if "_ahead" in packed.__dict__:

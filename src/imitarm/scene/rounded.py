@@ -37,7 +37,7 @@ _FLOOR = 1e-12  # [fraction of the shortest semi-axis] changes a distance by les
 
 
 def rounds(q: Array, gradient: bool, radius: Array, half: Array | None) -> tuple[Array, Array | None]:
-    """Spheres and capsules: the distance to the nearest point of a segment along z, minus the radius.
+    """Return distances to spheres and capsules: the distance to a segment along z, minus the radius.
 
     Args:
         q: points in the local frames, shape (3, ...) [m].
@@ -91,7 +91,7 @@ class Sphere(Obstacle):
         return Solid(self.kind, self.center, UPRIGHT, (self.radius, 0.0, 0.0))
 
     def signed_distance(self, points: ArrayLike) -> Array:
-        """Return the distance to the surface; unlike other shapes, a sphere needs no local frame.
+        """Return the distance to the surface, negative inside.
 
         Args:
             points: points in the base frame, shape (..., 3) [m].
@@ -124,8 +124,9 @@ class Sphere(Obstacle):
 class Capsule(Obstacle):
     """All points within ``radius`` of the segment from ``start`` to ``end``: ``sd(x) = |x - s(x)| - r``.
 
-    ``s(x) = a + clip((x - a).u, 0, L) u`` is the nearest point of the segment, with ``u`` its direction and
-    ``L`` its length. The overall length is ``L + 2 r``. If the segment has length zero, the capsule is a sphere.
+    ``s(x) = a + clip((x - a).u, 0, L) u`` is the nearest point of the segment. The segment has the start ``a``, the
+    direction ``u`` and the length ``L``. The overall length is ``L + 2 r``. If the segment has length zero, the capsule
+    is a sphere.
 
     Attributes:
         start: one end of the segment, in the base frame, shape (3,) [m].
@@ -171,14 +172,14 @@ def _unit(vectors: Array) -> Array:
 
 
 def ellipsoids(q: Array, gradient: bool, semi_axes: Array, beyond: Array, floor: Array) -> tuple[Array, Array | None]:
-    """Return distances to ellipsoids; the nearest surface point and its tangent plane follow from Newton's method.
+    """Return distances to ellipsoids; Newton's method finds the nearest surface point and its normal.
 
     The surface point nearest to ``y`` is ``e_j = g_j^2 y_j / (t + g_j^2)`` with semi-axes ``g``, where ``t`` is the
     largest root of ``F(t) = sum_j (g_j y_j / (t + g_j^2))^2 - 1``. With ``s = t + min g^2`` the function ``h(s) = 1 /
-    sqrt(F + 1)`` is concave and increasing. If Newton's method for ``h = 1`` starts at the left of the root, it
-    therefore never steps over the root and needs no bracket. With the unit normal ``n`` at the surface point ``e``, the
-    distance is ``n.y - sqrt(sum_j g_j^2 n_j^2)``. An error in ``n`` has only a quadratic effect on the distance and
-    never makes it too large.
+    sqrt(F + 1)`` is concave and increasing. Therefore, if Newton's method for ``h = 1`` starts to the left of the root,
+    it never steps over the root. With the unit normal ``n`` at the surface point ``e``, the distance is ``n.y -
+    sqrt(sum_j g_j^2 n_j^2)``. An error in ``n`` has only a quadratic effect on the distance and never makes it too
+    large.
 
     Args:
         q: points in the local frames, shape (3, ...) [m].

@@ -28,11 +28,11 @@ class Scene:
     Attributes:
         goal: tool_to_base at the end of the motion; None: the learned goal of the skill.
         obstacles: any iterable of obstacles; stored as a tuple.
-        stamp: time for which the poses of the obstacles are valid [s]. For a scene from a sensor, ``stamp`` is the time
-            of the measurement, from which :meth:`at` predicts.
+        stamp: time at which the obstacles have their poses [s]. For a scene from a sensor, this is the time of the
+            measurement. :meth:`at` predicts the poses at other times.
         fixtures: objects on which the arm stands or works, such as floor, pedestal and table. Fixtures are part of a
-            simulated world and cause contacts. Planners of a tool's path keep no distance from fixtures, because a tool
-            must reach its table.
+            simulated world and cause contacts. Planners that consider only the tool's path ignore fixtures, because the
+            tool must reach the table.
 
     Raises:
         InputError: when ``goal`` is not a pose, an entry of ``obstacles`` is not an obstacle, or ``stamp`` is not a
@@ -53,11 +53,11 @@ class Scene:
 
     @classmethod
     def predicted(cls, seen: Scene, packed: PackedObstacles, stamp: float) -> Scene:
-        """Return ``seen`` with the obstacle poses of ``packed``; code that moves obstacles itself needs this function.
+        """Return a copy of ``seen`` with other poses of the obstacles; the poses are those of ``packed``.
 
         Args:
-            seen: the scene from which the shapes, the goal and the fixtures are taken.
-            packed: poses and velocities that replace those of the obstacles of ``seen``.
+            seen: the scene with the shapes, the goal and the fixtures.
+            packed: the same obstacles with new poses and velocities.
             stamp: time for which the poses of ``packed`` are valid [s].
         """
         scene = object.__new__(cls)
@@ -70,7 +70,7 @@ class Scene:
         return PackedObstacles.of(self.obstacles, self.stamp)
 
     def at(self, time: float) -> Scene:
-        """Return the scene as predicted for another time; all predictions of obstacles use this method.
+        """Return the scene as predicted for another time.
 
         Each obstacle keeps its velocity and its angular velocity; the goal does not move. The result has ``stamp =
         time``; ``packed.stamps`` keeps the time at which each obstacle was seen. The prediction takes microseconds,
@@ -89,7 +89,9 @@ class Scene:
         return Scene.predicted(seen, seen.packed.after(time - seen.stamp), time)
 
     def now(self, time: float) -> Scene:
-        """Return the scene predicted by :meth:`at`, or this scene itself if no obstacle moves or ``time`` is its stamp.
+        """Return the scene predicted by :meth:`at`.
+
+        If no obstacle moves or ``time`` is the stamp, return this scene itself.
 
         Args:
             time: time on the clock of ``stamp`` [s].
@@ -235,14 +237,14 @@ class Scene:
         return f"{obstacle.kind} {alike}"
 
     def check(self, tool_radius: float = 0.0) -> None:
-        """Raise an error if the goal can't be reached without contact.
+        """Raise an error if the tool at the goal would touch an obstacle.
 
         Args:
-            tool_radius: radius of the sphere around the tool's tip that must stay free [m]; at least 0.
+            tool_radius: radius of a sphere around the tool's tip that must be clear of obstacles [m]; at least 0.
 
         Raises:
-            InputError: when the goal is closer than ``tool_radius`` to an obstacle or inside it; the message names
-                the obstacle and the overlap. The error is also raised when ``tool_radius`` is not a length.
+            InputError: when the goal is inside an obstacle or closer to it than ``tool_radius``. The message names the
+                obstacle and the overlap. The error is also raised when ``tool_radius`` is negative or not finite.
         """
         tool_radius = finite_number(tool_radius, "Scene.check: tool_radius", "m", at_least=0.0)
         if self.goal is None or not self.obstacles:

@@ -1,8 +1,8 @@
 """Scene files: a goal and obstacles in hand-written YAML (docs/scene.md).
 
-In the file, the keys of an obstacle are the fields of its shape's class. Therefore, a shape that is added to
-``OBSTACLES`` can be read and written without further code. The reader accepts only plain YAML (numbers, text, lists and
-mappings) and never executes anything in a file.
+In the file, the keys of an obstacle are the fields of its shape's class. Therefore, a new shape needs no code for
+reading and writing once its class is in ``imitarm.scene.OBSTACLES``. The reader accepts only plain YAML (numbers, text,
+lists and mappings) and never executes anything in a file.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
         path: YAML file in the format of docs/scene.md.
 
     Returns:
-        The scene in metres, regardless of the file's units. If an obstacle has a track, it gets the track's pose and
-        velocity at the scene's stamp; :func:`load_moving_scene` also returns the tracks.
+        The scene in metres, regardless of the file's units. An obstacle with a track (a recorded motion) has the
+        track's pose and velocity at the scene's stamp. The tracks are returned only by :func:`load_moving_scene`.
 
     Raises:
         InputError: when there is no such file or it can't be read.
@@ -92,12 +92,12 @@ def load_moving_scene(path: str | os.PathLike[str]) -> MovingScene:
 
 
 def save_scene(scene: Scene | MovingScene, path: str | os.PathLike[str]) -> None:
-    """Write a scene file in metres; :func:`load_scene` and :func:`load_moving_scene` read it back to the last digit.
+    """Write a scene file in metres. Reading the file gives exactly the same numbers.
 
-    The text is written to a temporary file, which is then renamed, so an existing file survives a failure.
+    If writing fails, an existing file at this path stays unchanged.
 
     Args:
-        scene: scene whose obstacles have shapes in ``OBSTACLES``. The motions of a moving scene must be tracks.
+        scene: scene with shapes from ``imitarm.scene.OBSTACLES``. The motions of a moving scene must be tracks.
         path: the file; its folder must exist.
 
     Raises:

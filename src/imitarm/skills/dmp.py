@@ -51,14 +51,13 @@ class DMPState(NamedTuple):
 
     Attributes:
         motion: [x; T x'], where T is the duration, shape (2, 3) [m].
-        fraction: fraction of the duration that has elapsed on the primitive's own clock; the phase is ``exp(-alpha
-            fraction)``.
+        fraction: time on the primitive's own clock, divided by the duration. The phase is ``exp(-alpha fraction)``.
         target: start, goal and duration of the motion.
         rotation: state of the rotation; None when no rotation was learned.
-        steps: length of a step, as a fraction of the duration, and number of steps so far; None if the steps differ in
-            length.
-        checked: the last ``motion`` array that was checked to be finite; None before a check. A step thus checks only a
-            state that the caller changed.
+        steps: length of the steps (as a fraction of the duration) and number of steps so far; None if the steps had
+            different lengths.
+        checked: the array ``motion`` that was last checked for finite numbers; None before the first check.
+            ``DMP.step`` checks ``motion`` only if it is another array.
     """
 
     motion: Array
@@ -112,20 +111,20 @@ class DMP:
     positions are not differentiated, and the samples need not be evenly spaced in time. The motion reaches the goal at
     the end of the duration.
 
-    **Another start or goal**: let ``p`` be the fraction of the path that has been travelled. A second primitive, which
-    moves from 0 to 1 with the weights w_p, computes this fraction.
-    The argument ``adjustment`` selects the weights of the new motion:
+    **Another start or goal**: let ``p`` be the fraction of the path that has been travelled. A second primitive with
+    the weights w_p, which moves from 0 to 1, computes ``p``. The argument ``adjustment`` selects the weights of the new
+    motion:
 
     * ``"progress"``: the weights are w + delta w_p, where delta is the change of g - x_0. The change of start and goal
-      is thus added in proportion to the travelled path. The motion therefore rests where the demonstration rests, and
-      does not reverse when the distance to the goal is halved. An axis without motion needs no special treatment.
+      is thus added in proportion to ``p``. The motion therefore rests where the demonstration rests. If the distance
+      between start and goal is halved, the motion does not reverse. An axis without motion needs no special treatment.
     * ``"hoffmann"``: the weights are the learned w, as in the published method. The change of start and goal then takes
       effect as fast as the spring allows.
     * ``"rotodilatation"``: the weights w are rotated and scaled in the same way as g - x_0 (Ginesi et al. 2019), so the
       whole shape of the path is rotated and scaled.
 
-    **Integration.** The integration is exact if the target is a parabola within each two-hundredth of the duration.
-    Therefore ``step`` and ``generate`` agree, and the path does not depend on the step length.
+    **Integration.** The integration is exact if the target is a parabola within each interval of 1/200 of the duration.
+    Therefore ``step`` and ``generate`` give the same path, and the path does not depend on the step length.
 
     Args:
         gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains`.
@@ -168,9 +167,9 @@ class DMP:
 
         Args:
             trajectory: the motion to reproduce.
-            exact_ends: whether to start and end exactly at the first and the last sample. If False, a first or last
-                sample may count as noise, because it is more than 0.1 mm away from the path that fits all samples. The
-                motion then starts or ends on this path.
+            exact_ends: whether the motion must start exactly at the first sample and end exactly at the last. If False,
+                a first or last sample that is more than 0.1 mm away from the path fitted to all samples may count as
+                noise. The motion then starts or ends on the fitted path.
 
         Raises:
             InputError: when the trajectory has fewer than 3 samples.
@@ -205,7 +204,7 @@ class DMP:
         path_length: float,
         orientation: QuaternionDMP | None = None,
     ) -> DMP:
-        """Build a primitive from learned weights; the arguments are the attributes of the class.
+        """Build a primitive from learned weights; the arguments become the attributes of the same names.
 
         Raises:
             InputError: when shapes disagree, a number is not finite, or the duration or a gain is not above 0.
@@ -374,8 +373,7 @@ class DMP:
     ) -> Trajectory:
         """Return the whole motion, ``round(duration / dt) + 1`` samples from 0 s to ``duration``.
 
-        The length of a step is ``dt``, adjusted so that a whole number of steps fills the duration. Without
-        ``coupling``, all samples are computed at once.
+        The time between two samples is approximately ``dt``: the duration divided by the nearest whole number of steps.
 
         Args:
             start: see :meth:`begin`.

@@ -1,7 +1,7 @@
 """The two dynamical systems of a movement primitive.
 
-The canonical system is the primitive's clock: the phase, and the basis functions over the phase. The transformation
-system is a spring and damper that follows a moving target; it is integrated exactly.
+The canonical system is the primitive's clock; it gives the phase and the basis functions of the phase. The
+transformation system is a spring and damper that follows a moving target.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class Gains(NamedTuple):
 
     @classmethod
     def of(cls, gains: str | Gains, what: str) -> Self:
-        """Return the gains of this name, or check and return the given gains.
+        """Return the gains with the given name, or check and return the given gains.
 
         Args:
             gains: a name in ``GAINS``, or stiffness and damping.
@@ -142,7 +142,7 @@ class Propagator(NamedTuple):
     Attributes:
         transition: transition matrix, shape (2, 2).
         drive: drive matrix, shape (2, 2 m + 1).
-        push: change of z during the step that an additional force of 1 in ``tau^2 x''`` causes, shape (2,).
+        push: change of z during one step if 1 is added to ``tau^2 x''``, shape (2,).
         instants: times at which the target is needed, shape (2 m + 1,). They are counted from the start of the step, in
             fractions of the motion's duration.
     """
@@ -195,8 +195,8 @@ def targets_by_step(step: Propagator, target: Array) -> Array:
 def roll_out(step: Propagator, start: Array, target: Array) -> Array:
     """Return the states after each of n steps, all computed at once.
 
-    The recursion is ``z_k = E z_(k-1) + q_k``. Each pass over the arrays doubles the number of terms that every state
-    contains. After j passes, a state contains its last 2^j terms, so n steps need log2(n) passes.
+    The recursion is ``z_k = E z_(k-1) + q_k``. Each state is a sum of such terms q. Each pass over the arrays doubles
+    the number of terms that every state contains. Therefore n steps need log2(n) passes.
 
     Args:
         step: propagator of one of the n equal steps.
@@ -262,10 +262,10 @@ class MovingTarget:
         return np.asarray(self.goal + basis_on_grid(len(self.drive), n_steps)[1] @ self.drive)
 
     def plan(self, gains: Gains, step: float) -> PlannedSteps | None:
-        """Return the plan of a whole motion in steps of length ``step`` (fraction of the duration), or None.
+        """Return all steps of a motion in advance, or None; ``step`` is their length as a fraction of the duration.
 
-        The target does not depend on the state, so one plan serves all steps. If the goal moves, however, the target
-        changes at every step, and a plan would be used only once. The first call with a step length therefore returns
+        The target does not depend on the state, so one plan serves the whole motion. If the goal moves, however, every
+        step has a new target, and a plan would be used only once. Therefore, the first call with a step length returns
         None, and only the second call computes the plan.
         """
         if step not in self._plans:
@@ -342,12 +342,13 @@ def fit_weights(
     the samples need not be evenly spaced in time. The regression minimises the position error of the reproduced motion
     in metres.
 
-    The motion passes exactly through its start and its goal. Start and goal are the first and the last sample. Noise
-    may move one of these samples more than 0.1 mm away from the path that fits all samples. A motion that is forced
-    through such a sample would have a high jerk. The end of the fitted path is then used instead, unless ``exact_ends``
-    is True. The last ``d_i`` is set to 0, so that the target equals the goal at the end of the duration. (The
-    regression hardly determines the last ``d_i``. Another value could pull the tool decimetres away from the goal after
-    the end of the motion.)
+    The motion passes exactly through its start and its goal, which are the first and the last sample. Noise may move
+    one of these samples more than 0.1 mm away from the path that fits all samples. A motion through such a sample would
+    have a high jerk. If ``exact_ends`` is False, the motion therefore starts or ends on the fitted path instead.
+
+    The last ``d_i`` is set to 0, so that the target equals the goal at the end of the duration. The regression hardly
+    determines the last ``d_i``. With another value, the tool could move decimetres away from the goal after the end of
+    the motion.
 
     Args:
         fraction: fraction of the duration, from 0 to 1, shape (n,).
@@ -356,7 +357,7 @@ def fit_weights(
         n_basis: number N of basis functions.
         regularisation: weight of the penalty in the ridge regression, relative to the mean square response of a basis
             function.
-        exact_ends: whether to use the first and the last sample without smoothing.
+        exact_ends: whether start and goal are always exactly the first and the last sample.
     """
     responses = _responses(gains, n_basis)
     R = responses.spline(fraction)
@@ -432,7 +433,7 @@ def start_rate(fraction: Array, x: Array, part: float = _START) -> Array:
     """Return the velocity at the first sample, in m per duration, shape (3,).
 
     The velocity is the slope of a parabola through the first samples. A velocity below three standard errors, or below
-    a tenth of the mean speed, is replaced by 0. A motion that begins at rest therefore begins exactly at rest.
+    a tenth of the mean speed, is replaced by 0.
 
     Args:
         fraction: fraction of the duration, from 0 to 1, shape (n,).

@@ -25,15 +25,15 @@ _REPEATS = 0.1  # of the difference between unrelated positions: a motion repeat
 
 
 class PoorFitWarning(UserWarning):
-    """Warns that a skill does not reproduce the motion of its demonstrations; see ``Skill.fit_quality_``."""
+    """A skill does not reproduce the motion of its demonstrations; ``Skill.fit_quality_`` has the measures."""
 
 
 @dataclass(frozen=True)
 class DemonstrationDistance:
-    """Distance between a skill's nominal path and one demonstration at equal times.
+    """Distance between a skill's nominal path (the mean of its regression) and one demonstration at equal times.
 
     Attributes:
-        source: the source of the demonstration.
+        source: source of the demonstration, for example a file name.
         rms: root mean square of the distance over the samples of the demonstration [m].
         largest: largest distance [m].
         start: distance at the first sample of the demonstration [m].
@@ -52,21 +52,21 @@ class FitQuality:
     """Measures of how well a skill fits its demonstrations.
 
     The bias is the root mean square distance between the skill and the average of the demonstrations at the same times.
-    Differences between demonstrations do not count as bias; the skill uses them as its tolerance. A skill with a bias
-    above 5 % of the motion's extent is not :attr:`faithful`. A skill whose path is much shorter than the average motion
-    is not faithful either, because it has lost bends.
+    Differences between demonstrations do not count as bias; the skill uses them as its tolerance. A skill is not
+    :attr:`faithful` if its bias exceeds 5 % of the motion's extent. It is also not faithful if its path is much shorter
+    than the average motion, because bends of the motion are then missing.
 
     Attributes:
         distances: distances of the nominal path to each demonstration.
-        n_components: number of Gaussians of the skill.
+        n_components: number of Gaussian components of the skill.
         extent: diagonal of the box that contains the average motion [m].
-        bias: bias of the nominal path [m].
+        bias: bias of the nominal path, which is the mean path of the regression [m].
         primitive_bias: bias of the movement primitive's path [m].
         rotation_extent: largest angle between the average rotation and its start [rad]; 0 without rotations.
         rotation_bias: bias of the nominal rotation [rad]; 0 without rotations.
         period: time after which the motion repeats [s]; None when it repeats less than three times.
-        length: length of the nominal path, divided by the length of the average motion. Bends that are smaller than 2 %
-            of the extent are left out of both lengths.
+        length: length of the nominal path, divided by the length of the average motion. Both lengths ignore bends
+            smaller than 2 % of the extent.
     """
 
     distances: tuple[DemonstrationDistance, ...]
@@ -109,7 +109,7 @@ class FitQuality:
         if self.length < LEAST_LENGTH and self.bias > _NO_BIAS[0] and not texts:
             texts.append(
                 f"the nominal path has lost bends of the motion: it is {100.0 * self.length:.0f} % as long as the "
-                f"average demonstration (at least {100 * LEAST_LENGTH:g} %)"
+                f"average demonstration (required: at least {100 * LEAST_LENGTH:g} %)"
             )
         if self.rotation_bias > max(LARGEST_BIAS * self.rotation_extent, _NO_BIAS[1]):
             texts.append(

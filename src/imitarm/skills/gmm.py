@@ -61,9 +61,9 @@ class GaussianMixture:
     (thesis 2.2.1). The names follow scikit-learn. This class differs from scikit-learn as follows:
 
     * Columns are standardised internally, so the result does not depend on the units.
-    * ``init="time"`` starts from the best division of column 0 into K segments
+    * ``init="time"`` divides column 0 into K segments such that one Gaussian describes each segment well
       (:func:`~imitarm.skills.mixture_fitting.responsibilities_by_segments`). This start is deterministic and is meant
-      for samples [t; x].
+      for samples [t; x] with the time t in column 0.
     * A constant column (such as z in a planar task) does not influence the other columns. ``degenerate_axes_`` lists
       such columns, and a :class:`DegenerateAxisWarning` reports them.
 
@@ -72,10 +72,10 @@ class GaussianMixture:
         reg_covar: smallest eigenvalue of a covariance, relative to the variances of the columns.
         n_init: number of starts; the best fit is kept. All starts except the first use k-means++ seeds.
         init: method for the first start: ``"time"`` (segments of column 0) or ``"kmeans++"``.
-        min_std: smallest standard deviation with which a column counts as moving, in the column's unit; one number for
-            all columns or one for each. A constant column is given this standard deviation.
+        min_std: a column whose standard deviation is at most this value counts as constant and gets this standard
+            deviation. Pass one number for all columns or one for each, in the column's unit.
         random_state: seed of the k-means++ starts.
-        tol: the iterations stop when the mean log-likelihood per sample changes by less than this.
+        tol: the iterations stop when the mean log-likelihood per sample changes by less than this value.
         max_iter: largest number of iterations of one start.
 
     Attributes:
@@ -228,7 +228,7 @@ class GaussianMixture:
 
     @property
     def n_parameters(self) -> int:
-        """Number of free parameters, without constant columns: K - 1 priors, K means and K symmetric covariances."""
+        """Number of free parameters: K - 1 priors, K means and K symmetric covariances, without constant columns."""
         K, d = self.n_components, self.means_.shape[1] - len(self.degenerate_axes_)
         return K - 1 + K * d + K * d * (d + 1) // 2
 

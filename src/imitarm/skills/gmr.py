@@ -69,14 +69,15 @@ class GMR:
     at the nearest end of the span, because an extrapolation would drift away.
 
     Args:
-        n_components: number K of Gaussians, or ``"auto"``. ``"auto"`` takes the smallest K with a small bias that
-            reproduces held-out demonstrations as well as any other K, see
-            :func:`~imitarm.skills.mixture_fitting.choose`.
+        n_components: number K of Gaussians, or ``"auto"``. ``"auto"`` takes the smallest K with a small bias and an
+            error on held-out demonstrations that is about as small as with any other K
+            (:func:`~imitarm.skills.mixture_fitting.choose`).
         candidates: the numbers of Gaussians that ``"auto"`` tries; None: 2 to 16, and larger numbers as long as the
             bias is large.
         reg_covar: see :class:`~imitarm.skills.gmm.GaussianMixture`.
         n_init: see :class:`~imitarm.skills.gmm.GaussianMixture`.
-        min_std: smallest standard deviations with which an axis counts as moving (position [m], rotation [rad]).
+        min_std: an axis counts as constant if its standard deviation is at most this value. Pass two values, one for
+            positions [m] and one for rotation vectors [rad].
         random_state: seed of the additional starts when ``n_init`` is above 1.
 
     Attributes:
@@ -139,8 +140,8 @@ class GMR:
     def fit(self, demonstrations: Sequence[Demonstration | Trajectory]) -> Self:
         """Learn from demonstrations that were aligned before (``imitarm.demonstrations.align``).
 
-        Times may start anywhere, because the first time of each demonstration is subtracted. Durations that differ by
-        more than 1 % are scaled to their median, and the method issues an :class:`UnalignedWarning`.
+        Times may start anywhere, because the first time of each demonstration is subtracted. All durations are scaled
+        to their median. If they differ by more than 1 %, the method issues an :class:`UnalignedWarning`.
 
         Raises:
             InputError: when there is no demonstration, only some have quaternions, or there are fewer samples than
@@ -179,8 +180,8 @@ class GMR:
         still = [_AXES[i] for i in self.degenerate_axes_ if i < len(_AXES)]
         if still:  # rotations about one axis only, or none, are usual
             warnings.warn(
-                f"the demonstrations do not move in {', '.join(still)}; the skill is constant there, without effect on "
-                "the other axes",
+                f"the demonstrations do not move in {', '.join(still)}; the skill keeps these coordinates constant and "
+                "learns the others",
                 DegenerateAxisWarning,
                 stacklevel=2,
             )
@@ -360,8 +361,9 @@ class GMR:
 
         The correction at the start lasts until the centre of the first Gaussian, :math:`w_1 = \mu_1^t`. The correction
         at the goal begins at the centre of the last Gaussian, so :math:`w_K = T - \mu_K^t`, where T is the duration.
-        Both widths are at least a twentieth of the duration. The correction depends only on time, so moving the mean of
-        Gaussian k by :math:`\Delta_k` still moves the path by :math:`h_k(t) \Delta_k`.
+        Both :math:`w_1` and :math:`w_K` are at least a twentieth of the duration. The correction depends only on time.
+        If a policy moves the mean of Gaussian k by :math:`\Delta_k`, the path therefore still moves by :math:`h_k(t)
+        \Delta_k`.
 
         Returns:
             Positions (n, 3) [m] and quaternions wxyz (n, 4); None instead of quaternions if no rotations were learned.
@@ -405,7 +407,7 @@ def samples_of(
 ) -> tuple[list[Array], RotationReference | None, float]:
     """Return the samples of each demonstration as a table, with times scaled to run from 0 to the median duration.
 
-    Rotations, when all demonstrations have them, become rotation vectors from a common reference.
+    If all demonstrations have rotations, these become rotation vectors relative to a common reference.
 
     Returns:
         Tables of rows [t, x, y, z] or [t, x, y, z, r1, r2, r3], the reference of the rotations or None, and the

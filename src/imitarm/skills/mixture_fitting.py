@@ -5,16 +5,15 @@ The logarithm of a weighted Gaussian is linear in the quadratic features ``phi(z
     log pi_k N(z; mu_k, Sigma_k) = theta_k . phi(z)
 
 Therefore, one matrix product, ``theta @ phi``, computes all log-densities. A second matrix product, ``responsibilities
-@ phi^T``, computes all sufficient statistics. No loop over components or samples is needed. The statistics of one
-component form a symmetric matrix M, the second moments of ``[1; z]``. With ``P = Sigma^-1``, the inverse of M contains
-all parts of ``theta_k``::
+@ phi^T``, computes all sufficient statistics. The statistics of one component form a symmetric matrix M, the second
+moments of ``[1; z]``. With ``P = Sigma^-1``, the inverse of M contains all parts of ``theta_k``::
 
     M = [1     mu^T             ]     M^-1 = [1 + mu^T P mu   -mu^T P]     det M = det Sigma
         [mu    Sigma + mu mu^T  ]            [-P mu            P     ]
 
-Several fits may differ only in their start (restarts) or in their samples (folds of a cross-validation). Such fits are
-computed together, as further rows of the two matrix products. The samples must be standardised (each column with mean 0
-and standard deviation 1), so that the sums of squares are well conditioned.
+Fits that differ only in their start (restarts) or in their samples (folds of a cross-validation) are computed together,
+as further rows of the two matrix products. The samples must be standardised (each column with mean 0 and standard
+deviation 1), so that the sums of squares are well conditioned.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ class Fit(NamedTuple):
 
     Attributes:
         weights: priors pi, shape (B, K).
-        moments: second moments of [1; z], which are the matrix M in the docstring of this module, shape (B, K, d + 1, d
+        moments: the matrix M of the module's docstring, which holds the second moments of [1; z], shape (B, K, d + 1, d
             + 1).
         theta: weights of the quadratic features, shape (B, K, F), F = (d + 1) (d + 2) / 2.
         log_likelihood: mean log-likelihood per sample at exactly these parameters, shape (B,).
@@ -161,7 +160,7 @@ def log_densities(theta: Array, features: Array) -> Array:
 
 
 def normalise(log_density: Array) -> tuple[Array, Array]:
-    """Return responsibilities (B, K, n), written over ``log_density``, and log-likelihoods of the samples (B, n)."""
+    """Return responsibilities (B, K, n), which overwrite ``log_density``, and the samples' log-likelihoods (B, n)."""
     top = log_density.max(axis=1)
     ratio = np.subtract(log_density, top[:, None], out=log_density)
     np.maximum(ratio, _NOTHING, out=ratio)
@@ -207,22 +206,22 @@ def expectation_maximisation(
 
 
 def responsibilities_by_segments(features: Array, column: Array, numbers: Sequence[int]) -> list[Array]:
-    """Divide time into K segments, each of which one Gaussian describes as well as possible, for several K at once.
+    """Divide time into K segments so that one Gaussian describes each segment well, for several K at once.
 
     The range of ``column`` is divided into equal slots. The cost of a segment with n of the N samples and covariance
-    Sigma is ``n (log det Sigma / 2 - log(n / N))``, its negative log-likelihood under a separate Gaussian. A small cost
-    for the squared length of each segment is added. This cost makes the lengths equal if the samples do not determine
-    them. Dynamic programming over the slots finds the cheapest division for every K up to the largest. The result is
-    deterministic. When EM starts from this result, it converges in fewer iterations than from equal bins.
+    Sigma is ``n (log det Sigma / 2 - log(n / N))``, its negative log-likelihood under a separate Gaussian. A small
+    additional cost for the squared length of each segment makes the lengths equal if the samples do not determine them.
+    Dynamic programming over the slots finds the cheapest division for every K up to the largest. The result is
+    deterministic. EM that starts from this result needs fewer iterations than EM that starts from equal bins.
 
     Args:
         features: :func:`quadratic_features` of the standardised samples, shape (F, n).
         column: times of the samples, shape (n,).
-        numbers: values of K; there is one division of the time for each value.
+        numbers: values of K; for each of them, the function returns one division.
 
     Returns:
-        Responsibilities of 0 or 1, shape (K, n), in the order of time, for each K. If there are few samples or gaps in
-        time, the segments are equal bins.
+        One array for each K: responsibilities of 0 or 1, shape (K, n), with the segments in the order of time. If there
+        are too few samples or gaps in time, the segments are equal bins.
     """
     most = max(numbers)
     n_slots = max(_SLOTS, 4 * most)
@@ -285,7 +284,7 @@ def responsibilities_by_bins(column: Array, n_bins: int) -> Array:
 
 @dataclass(frozen=True)
 class Candidate:
-    """The errors and criteria of one number of components.
+    """Errors and information criteria of the fit with one number of components.
 
     Attributes:
         n_components: the number K.
@@ -316,9 +315,11 @@ def choose(candidates: Sequence[Candidate]) -> int:
       a bias. The square of this error is the sum of the squared bias and much larger squared differences.
 
     If no K meets both conditions, only the K that meet the first condition are compared. The result is the smallest of
-    these K whose bias exceeds the lowest bias by at most 10 %. A held-out error needs at least two demonstrations; with
-    a single demonstration, BIC decides. BIC is not used otherwise, because it prefers too large K for time series,
-    whose neighbouring samples are not independent.
+    these K whose bias exceeds their lowest bias by at most 10 %.
+
+    A held-out error needs at least two demonstrations. With a single demonstration, the K with the lowest BIC is
+    returned. Otherwise, BIC is not used: it prefers too large K for time series, whose neighbouring samples are not
+    independent.
     """
     ordered = sorted(candidates, key=lambda c: c.n_components)
     if any(np.isnan(c.held_out_rmse_mm) for c in ordered):
@@ -345,17 +346,18 @@ def try_numbers_of_components(
 
     For each number, one fit uses all demonstrations, and each further fit leaves out one demonstration. These fits are
     computed together. They use only a subset of the samples, which is larger for a longer path. If the tool only
-    rotates, errors are computed for a point 100 mm from the axis. The search stops when four consecutive numbers of
-    components do not reduce the held-out error by 0.5 %, and one of the numbers meets both conditions of
-    :func:`choose`.
+    rotates, errors are computed for a point 100 mm from the axis of rotation. The search stops when two conditions are
+    met. Four consecutive numbers of components have not reduced the held-out error by 0.5 %. One of the tried numbers
+    meets both conditions of :func:`choose`.
 
     Args:
         tables: samples [t, x, y, z, ...] of each demonstration, over the same span of time.
         numbers: numbers K of components to try.
-        min_std: smallest standard deviation with which each column counts as moving, in the column's unit.
+        min_std: a column counts as constant if its standard deviation is at most this value; one value for each column,
+            in the column's unit.
         reg_covar: lower bound of the eigenvalues of a covariance, relative to the variances of the columns.
-        more: further numbers, which are tried in this order as long as every bias is above 1 % of the motion's extent,
-            or every learned path is shorter than 95 % of the motion.
+        more: further numbers to try in this order. They are tried until one fit has a bias of at most 1 % of the
+            motion's extent, and one learned path has at least 95 % of the motion's length.
 
     Raises:
         InputError: when there are fewer samples than the smallest number of components.

@@ -1,6 +1,7 @@
-"""Bends of a motion: the length of a learned path compared with the motion, and the angle by which a motion turns.
+"""Measures of the bends of a motion: the relative length of a learned path, and the angle by which a motion turns.
 
-A path that is much shorter than the motion has lost bends. The more a motion turns, the more samples represent it.
+A path that is much shorter than the motion has lost bends. The more a motion turns, the more samples are needed to
+represent it.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ _RULER = 0.02  # of the motion's extent: smaller bends do not count
 
 
 def relative_length(path: Array, motion: Array) -> float:
-    """Return the length of a path (n, d), divided by the length of a motion (m, d) without its smallest bends.
+    """Return the length of a path (n, d), divided by the length of a motion (m, d), both without their smallest bends.
 
     Both lengths are sums of chords of at least 2 % of the motion's extent, so that noise does not count.
     """

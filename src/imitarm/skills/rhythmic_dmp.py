@@ -26,7 +26,7 @@ _CLOSES = 0.1  # of the extent: a motion that ends a period further than this fr
 class RhythmicDMPState(NamedTuple):
     """State of a rhythmic movement primitive during a motion.
 
-    ``RhythmicDMP.begin`` creates it and ``RhythmicDMP.step`` advances it.
+    ``RhythmicDMP.begin`` creates a state and ``RhythmicDMP.step`` advances it.
 
     Attributes:
         motion: [x; P x'] with the period P, shape (2, D). The coordinates x are the position [m] and, if rotation was
@@ -63,11 +63,11 @@ class RhythmicDMP:
         f(\phi) = \frac{\sum_i w_i \psi_i(\phi)}{\sum_i \psi_i(\phi)}, \quad
         \psi_i(\phi) = \exp(h (\cos(\phi - c_i) - 1))
 
-    Here, tau is the period, g the centre of the motion and r its amplitude. These equations are the rhythmic form of
-    Ijspeert et al. (2013). Ridge regression on the positions gives the weights. The spring's periodic response to each
-    basis function is known exactly, because the spring multiplies the k-th Fourier coefficient by ``K / (K - (2 pi k)^2
-    + 2 pi k D i)``, where i is the imaginary unit. Rotations are represented by rotation vectors relative to their mean
-    rotation. All rotations must stay within 120 degrees of the mean.
+    Here, x is the position, tau the period, phi the phase, g the centre of the motion and r its amplitude. These
+    equations are the rhythmic form of Ijspeert et al. (2013). Ridge regression on the positions gives the weights. The
+    spring's periodic response to each basis function is known exactly, because the spring multiplies the k-th Fourier
+    coefficient by ``K / (K - (2 pi k)^2 + 2 pi k D i)``, where i is the imaginary unit. Rotations are represented by
+    rotation vectors relative to their mean rotation. All rotations must stay within 120 degrees of the mean.
 
     Args:
         gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains`.
@@ -169,7 +169,7 @@ class RhythmicDMP:
         """Return the state at phase 0.
 
         Args:
-            start: position of the resting tool, from which the motion approaches the learned cycle; None: the motion
+            start: pose in which the tool rests; from there, the motion approaches the learned cycle. None: the motion
                 begins on the learned cycle.
             center: centre of the motion's positions (3,) [m]; None: the learned centre.
             amplitude: factor by which the learned motion is multiplied.
@@ -213,8 +213,8 @@ class RhythmicDMP:
         """Return the state ``dt`` seconds later.
 
         Args:
-            state: state returned by :meth:`begin` or by the last step; replace ``amplitude``, ``center`` or ``period``
-                in it to change the motion while it runs.
+            state: state returned by :meth:`begin` or by the last step; to change the motion during its execution,
+                replace the state's ``amplitude``, ``center`` or ``period``.
             dt: [s], above 0.
             coupling: function from position and velocity to an acceleration (3,) [m/s^2] that is added during this
                 step.

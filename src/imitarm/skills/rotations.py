@@ -48,8 +48,8 @@ class RotationReference:
     """A fixed or moving reference rotation; other rotations are represented as rotation vectors relative to it.
 
     A rotation ``R`` near the reference ``R_ref(t)`` has the rotation vector ``r = log(R R_ref(t)^T)`` [rad] in the base
-    frame. A fixed reference suffices if all rotations differ from the reference by clearly less than 180 degrees. A
-    longer rotation needs a moving reference, which is a normalised cubic spline through a few quaternions (the keys).
+    frame. A fixed reference suffices if all rotations differ from it by clearly less than 180 degrees. Otherwise, the
+    reference must move: it is a normalised cubic spline through a few quaternions (the keys).
 
     Attributes:
         times: times of the keys [s], strictly increasing, shape (m,); a single key is a fixed reference.
@@ -92,7 +92,7 @@ class RotationReference:
         return np.asarray(q / np.linalg.norm(q, axis=1, keepdims=True))
 
     def to_vectors(self, times: ArrayLike, quaternions: ArrayLike) -> Array:
-        """Return rotation vectors (n, 3) [rad] of rotations (n, 4) wxyz at ``times`` (n,); signs do not matter."""
+        """Return rotation vectors (n, 3) [rad] of rotations (n, 4) wxyz at ``times`` (n,); q and -q give the same."""
         reference = self.at(times)
         q = finite_array(quaternions, (len(reference), 4), "RotationReference: quaternions")
         return quaternion_log(quaternion_multiply(q, quaternion_conjugate(reference)))
@@ -114,7 +114,8 @@ class RotationReference:
             demonstrations: times (n,) [s] on a common clock, and quaternions (n, 4) wxyz, of each demonstration.
 
         Raises:
-            InputError: when demonstrations differ so much at the same time that there is no such reference.
+            InputError: when no such reference exists, because the rotations of the demonstrations differ too much at
+                the same time.
         """
         end = min(float(times[-1]) for times, _ in demonstrations)
         farthest = np.inf
@@ -183,12 +184,12 @@ class QuaternionDMP:
         r = \log(R R_y(s)^T), \qquad \tau^2 \ddot r = -K r - D \tau \dot r + \tau^2 c
 
     Here, c is an external angular acceleration. The logarithm is applied only to ``R R_y^T``, the rotation from the
-    target to ``R``, and never to the rotation to the goal. Therefore, the primitive can reproduce a rotation by 270
-    degrees, or by three full revolutions. (Formulations that use log(q_goal conj(q)) rotate in the opposite direction
-    beyond 180 degrees.) The target is a normalised cubic spline through quaternions with continuous signs. For another
-    start or goal, the target is rotated in the base frame by ``d_start`` at the start and by ``d_goal`` at the goal. A
-    minimum-jerk profile b, from 0 to 1, blends these two rotations: ``exp((1 - b) d_start) exp(b d_goal) R_y``. Both
-    ``d_start`` and ``d_goal`` are rotations by at most 180 degrees.
+    target to ``R``, and not to the rotation from ``R`` to the goal. Therefore, the primitive can reproduce a rotation
+    by 270 degrees, or by three full revolutions. (Formulations that use log(q_goal conj(q)) rotate in the opposite
+    direction beyond 180 degrees.) The target is a normalised cubic spline through quaternions with continuous signs.
+    For another start or goal, the target is rotated in the base frame by ``d_start`` at the start and by ``d_goal`` at
+    the goal. A minimum-jerk profile b, from 0 to 1, blends these two rotations: ``exp((1 - b) d_start) exp(b d_goal)
+    R_y``. Both ``d_start`` and ``d_goal`` are rotations by at most 180 degrees.
 
     Args:
         gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains`.
@@ -212,7 +213,8 @@ class QuaternionDMP:
 
         Args:
             trajectory: the motion to reproduce.
-            exact_ends: whether to start and end exactly at the first and the last rotation instead of smoothing them.
+            exact_ends: whether the motion must start and end exactly at the first and the last rotation. If False,
+                these rotations are smoothed like all others.
 
         Raises:
             InputError: when ``trajectory`` has no quaternions, or two neighbouring rotations are more than 90 degrees
@@ -250,11 +252,11 @@ class QuaternionDMP:
 
     @classmethod
     def from_spline(cls, knots: ArrayLike, coefficients: ArrayLike, gains: Gains) -> QuaternionDMP:
-        """Build a primitive from a learned spline; the arguments are the attributes of the class.
+        """Build a primitive from a learned spline; the arguments become the attributes of the same names.
 
         Raises:
-            InputError: when the knots don't run from 0 to 1 in order, shapes disagree, or the spline passes near zero,
-                where it is not a rotation.
+            InputError: when the knots don't increase from 0 to 1, shapes disagree, or the spline comes near the zero
+                quaternion, which is not a rotation.
         """
         t = finite_array(knots, (None,), "QuaternionDMP.from_spline: knots").copy()
         c = finite_array(coefficients, (None, 4), "QuaternionDMP.from_spline: coefficients").copy()
@@ -325,7 +327,7 @@ class QuaternionDMP:
         return state._replace(quaternion=self.target(state, np.zeros(1))[0])
 
     def target(self, state: RotationState, fraction: ArrayLike) -> Array:
-        """Return the target rotations (n, 4) wxyz at fractions (n,) of the duration, for the ends in ``state``.
+        """Return the target rotations (n, 4) wxyz of ``state``'s motion at fractions (n,) of the duration.
 
         Raises:
             InputError: when not fitted, or an argument is not valid.
@@ -374,10 +376,10 @@ def with_other_ends(quaternions: Array, fraction: Array, start_change: Array, go
 
 
 def rotodilatation(learned: Array, asked: Array, path_length: float) -> Array:
-    """Return the scaled rotation matrix, with the smallest angle, that maps ``learned`` to ``asked``, shape (3, 3).
+    """Return the matrix (3, 3) that maps ``learned`` to ``asked`` by the smallest possible rotation and a scaling.
 
-    The method follows Ginesi, Sansonetto and Fiorini (2019), "DMP++". If the learned motion ends near its start, its
-    direction and length are undefined, and the result is the identity.
+    The method follows Ginesi, Sansonetto and Fiorini (2019), "DMP++". If the learned motion ends near its start, the
+    vector between them is not meaningful, and the result is the identity.
 
     Args:
         learned: vector from the learned start to the learned goal, shape (3,) [m].

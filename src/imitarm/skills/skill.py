@@ -38,7 +38,7 @@ class Skill:
     demonstrations differ at each time. A :class:`~imitarm.skills.dmp.DMP` is fitted to the nominal path (the mean
     motion with exact start and goal). The DMP can change the start, the goal and the duration of the motion. The
     covariance serves as a tolerance, because the robot must be precise where the person was precise. A skill does not
-    depend on obstacles; policies avoid them.
+    depend on obstacles; policies avoid obstacles.
 
     The nominal path and the primitive start and end exactly at the means of the demonstrated starts and goals.
 
@@ -58,8 +58,8 @@ class Skill:
         start_: learned start, tool_to_base; its rotation is the identity when no rotation was learned.
         goal_: learned goal, tool_to_base.
         n_demonstrations_: number of demonstrations.
-        fit_quality_: distance from the skill's motion to each demonstration, and whether the skill reproduces the
-            demonstrations; None if the skill's file does not contain it.
+        fit_quality_: distances between the skill's motion and each demonstration, and whether the skill reproduces the
+            demonstrations. None if the skill was read from a file without these measures.
         provenance_: origin of the skill: ``"imitarm"`` (version that learned it), ``"sources"`` (one per
             demonstration), ``"notes"`` (for example findings of lint), and ``"date"`` if a date was given.
 
@@ -189,7 +189,7 @@ class Skill:
     def nominal(
         self, times: ArrayLike, start: Pose | ArrayLike | None = None, goal: Pose | ArrayLike | None = None
     ) -> Trajectory:
-        r"""Return the nominal path, which policies reproduce, at ``times`` [s] of the learned duration.
+        r"""Return the nominal path, which policies reproduce, at ``times``.
 
         The path starts and ends exactly at ``start`` and ``goal``, for any number of samples. The learned path is
         :meth:`~imitarm.skills.gmr.GMR.nominal`. Another start or goal changes the path in the same way as the
@@ -198,7 +198,8 @@ class Skill:
         .. math:: x(t) = \bar x(t) + (1 - p(t)) \delta_{start} + p(t) \delta_{goal}
 
         Here, :math:`\bar x` is the learned path, p is the fraction of the path that has been travelled, and
-        :math:`\delta` are the changes of start and goal. The rotation changes along a minimum-jerk profile.
+        :math:`\delta_{start}` and :math:`\delta_{goal}` are the changes of start and goal. The rotation changes along a
+        minimum-jerk profile.
 
         Args:
             times: strictly increasing times from 0 to the learned duration, shape (n,) [s].
@@ -245,10 +246,10 @@ class Skill:
         return self._fitted().generate(start, goal, duration, dt, adjustment=adjustment)
 
     def tolerance(self, times: ArrayLike, duration: float | None = None) -> Array:
-        """Return how much the demonstrations differ at ``times`` (n,) [s]: covariances (n, 3, 3) [m^2].
+        """Return how much the demonstrated positions differ at ``times`` (n,) [s]: covariances (n, 3, 3) [m^2].
 
         Args:
-            times: times since the start of a motion of length ``duration``.
+            times: times since the start of a motion that lasts ``duration``, shape (n,) [s].
             duration: duration of the motion [s]; None: the learned duration.
 
         Raises:
@@ -261,7 +262,7 @@ class Skill:
         return self.gmr_.predict(t)[1]
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a skill file (:mod:`imitarm.skills.skill_file`): JSON, human-readable, checked when it is read.
+        """Write a skill file in JSON (:mod:`imitarm.skills.skill_file`).
 
         Args:
             path: file to write; an existing file is replaced.

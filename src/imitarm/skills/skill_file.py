@@ -2,9 +2,9 @@
 
 The file contains ``format`` and ``version``, the meaning of the numbers (``units``, ``frames``), and their origin
 (``task``, ``provenance``). Then come the numbers (``gmr``, ``dmp``, ``fit``) and a ``checksum``. The checksum is the
-SHA-256 of everything else in canonical form (sorted keys, no spaces). The checksum therefore detects the change of any
-digit, but accepts a different layout. Floats are written with all digits and are read back exactly. The classes below
-are the schema, which defines the content of the file.
+SHA-256 of the other content, with sorted keys and without spaces. It therefore detects every changed digit, but does
+not depend on line breaks and spaces. Floats are written with all digits and are read back exactly. The classes in this
+module define the content of the file.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class ReferenceFields(msgspec.Struct):
 
 
 class SelectionFields(msgspec.Struct, omit_defaults=True):
-    """The results for all numbers of components that were tried."""
+    """The results of the search for the number of components, one row for each number that was tried."""
 
     rows: Table = msgspec.field(name="n_components, bic, aic, bias_rmse_mm")
     held_out_rmse_mm: Row | None = None
@@ -137,7 +137,7 @@ class SkillDocument(msgspec.Struct, omit_defaults=True):
 
 
 def gmr_fields(gmr: GMR) -> GmrFields:
-    """Return the fields of a regression."""
+    """Convert a regression to the fields of a skill file."""
     reference = selection = None
     if gmr.reference_ is not None:
         reference = ReferenceFields(gmr.reference_.times.tolist(), gmr.reference_.quaternions.tolist())
@@ -161,7 +161,7 @@ def gmr_fields(gmr: GMR) -> GmrFields:
 
 
 def gmr_of(fields: GmrFields) -> GMR:
-    """Build a regression from its fields.
+    """Build a regression from the fields of a skill file.
 
     Raises:
         InputError: when a field is out of range.
@@ -192,7 +192,7 @@ def gmr_of(fields: GmrFields) -> GMR:
 
 
 def dmp_fields(dmp: DMP) -> DmpFields:
-    """Return the fields of a primitive."""
+    """Convert a primitive to the fields of a skill file."""
     orientation = None
     if dmp.orientation_ is not None:
         orientation = OrientationFields(dmp.orientation_.knots_.tolist(), dmp.orientation_.coefficients_.tolist())
@@ -211,7 +211,7 @@ def dmp_fields(dmp: DMP) -> DmpFields:
 
 
 def dmp_of(fields: DmpFields) -> DMP:
-    """Build a primitive from its fields.
+    """Build a primitive from the fields of a skill file.
 
     Raises:
         InputError: when a field is out of range.
@@ -234,7 +234,7 @@ def dmp_of(fields: DmpFields) -> DMP:
 
 
 def fit_fields(fit: FitQuality) -> FitFields:
-    """Return the fields of a fit's quality."""
+    """Convert the measures of a fit to the fields of a skill file."""
     return FitFields(
         [[d.rms, d.largest, d.start, d.goal] for d in fit.distances],
         fit.extent,
@@ -248,7 +248,7 @@ def fit_fields(fit: FitQuality) -> FitFields:
 
 
 def fit_of(fields: FitFields, sources: list[str], n_components: int) -> FitQuality:
-    """Build a fit's quality from its fields.
+    """Build the measures of a fit from the fields of a skill file.
 
     Raises:
         InputError: when the number of rows of distances differs from the number of sources.
