@@ -65,5 +65,5 @@ def test_predictions_of_tracked_obstacles_are_recorded_frame_by_frame() -> None:
     np.testing.assert_allclose(prediction.covariances[2], 2e-4 * np.eye(3))
     np.testing.assert_allclose(prediction.extent, 0.1)
     whole = recorder.recording()
-    with pytest.raises(InputError, match="sphere 1 has 4 positions for 3 frames"):
+    with pytest.raises(InputError, match="sphere 1 has 4 positions, but needs 3"):
         Recording(model, whole.times[1:], whole.positions[1:], whole.quaternions[1:], whole.predictions)

@@ -1,6 +1,6 @@
 """Motions: Trajectory (timed poses), Demonstration (a demonstrated motion), Rollout (a motion executed by a robot).
 
-All three are frozen, and their arrays are read-only copies.
+Objects of these classes cannot be changed, and their arrays are read-only copies.
 """
 
 from __future__ import annotations
@@ -117,11 +117,13 @@ class Trajectory:
 
     @property
     def path_length(self) -> float:
-        """Length of the polyline through all positions [m]."""
+        """Sum of the distances between successive positions [m]."""
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
     def at(self, times: ArrayLike) -> tuple[Array, Array | None]:
-        """Interpolate positions linearly and rotations along the shortest arc; both are constant outside the times.
+        """Interpolate positions linearly and rotations along the shortest arc.
+
+        Outside the times, return the nearest sample.
 
         Args:
             times: query times [s], shape (m,), or one number.
@@ -168,7 +170,7 @@ class Trajectory:
         return moved
 
     def from_zero(self) -> Trajectory:
-        """Return the same motion with its first time at 0 s."""
+        """Return the same motion with shifted times, so that it begins at 0 s."""
         return Trajectory(self.times - self.times[0], self.positions, self.quaternions)
 
 
@@ -181,7 +183,8 @@ class Demonstration:
         joints: joint angles (n, n_joints) [rad] of the arm that was guided; None when they were not recorded.
         task: name of the demonstrated task, for example ``"sweep"``.
         source: origin of the motion, for example a file name, a range of rows in a file, or the name of a recorder.
-        joint_names: one name for each column of ``joints``; ``joint_1``, ``joint_2``, ... when not given.
+        joint_names: one name for each column of ``joints``. Without names, they are called ``joint_1``, ``joint_2`` and
+            so on.
 
     Raises:
         InputError: when ``joints`` does not have one row for each sample, or ``joint_names`` does not have one name for
@@ -333,7 +336,7 @@ class Rollout:
         torques: torques of the joints' drives (n, n_joints) [N m].
         clearance: smallest distance between the arm (with its tool) and any obstacle (n,) [m]; negative when arm and
             obstacle overlap, inf without obstacles.
-        success: whether the motion was finished in time.
+        success: whether the motion reached its end within the time limit.
         reason: explanation of why the motion ended.
         details: further measurements of the robot or the task, by name.
 

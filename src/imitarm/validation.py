@@ -54,7 +54,8 @@ def finite_array(value: Any, shape: tuple[int | EllipsisType | None, ...], what:
 
     Args:
         value: the argument to check.
-        shape: the length of each axis; None allows any length. ``...`` as the first entry allows any leading axes.
+        shape: required length of each axis. The entry None allows any length. The first entry ``...`` allows any number
+            of leading axes.
         what: the name of the argument in messages.
         unit: the unit of the numbers in messages.
 
@@ -68,7 +69,7 @@ def finite_array(value: Any, shape: tuple[int | EllipsisType | None, ...], what:
 
 
 def finite_points(points: Any) -> Array:
-    """Return finite points as an array of shape (..., 3).
+    """Return ``points`` as an array of finite numbers, shape (..., 3), float64.
 
     Raises:
         InputError: when the points are not numbers, the last axis does not have length 3, or a number is not finite.
@@ -150,7 +151,7 @@ def flag(value: Any, what: str) -> bool:
     """Return ``value`` as True or False.
 
     Raises:
-        InputError: when the value is not a boolean; ``"no"`` and ``0`` are not booleans.
+        InputError: when the value is not a boolean, for example ``"no"`` or ``0``.
     """
     if not isinstance(value, bool | np.bool_):
         raise InputError(f"{what} must be True or False, got {_shown(value)}")
@@ -169,7 +170,7 @@ def text(value: Any, what: str) -> str:
 
 
 def instance(value: Any, kind: type[T], what: str) -> T:
-    """Return ``value`` when it is an object of the class ``kind``.
+    """Return ``value`` unchanged if it is an object of the class ``kind``.
 
     Raises:
         InputError: when the value is of another class.
@@ -180,10 +181,10 @@ def instance(value: Any, kind: type[T], what: str) -> T:
 
 
 def finite_numbers(value: Any, what: str, unit: str = "") -> Array:
-    """Return one finite number or a sequence of them as an array of shape (n,), float64.
+    """Return a finite number, or a sequence of finite numbers, as an array of shape (n,), float64.
 
     Raises:
-        InputError: when the value is neither one finite number nor a sequence of finite numbers.
+        InputError: when the value is something else.
     """
     array = finite_array(value, (...,), what, unit)
     if array.ndim > 1:
@@ -192,7 +193,7 @@ def finite_numbers(value: Any, what: str, unit: str = "") -> Array:
 
 
 def choice(value: Any, names: Iterable[str], what: str) -> str:
-    """Return ``value`` when it is one of ``names``.
+    """Return ``value`` unchanged if it is one of ``names``.
 
     Raises:
         UnknownNameError: when ``value`` is not one of ``names``; the message lists the names.
@@ -205,12 +206,10 @@ def choice(value: Any, names: Iterable[str], what: str) -> str:
 
 
 def sequence(value: Any, kind: type[T], what: str) -> tuple[T, ...]:
-    """Return ``value`` as a tuple when it is a sequence of objects of the class ``kind``.
-
-    A text does not count as a sequence.
+    """Return a sequence of objects of the class ``kind`` as a tuple; a string is not accepted as a sequence.
 
     Raises:
-        InputError: when the value is not such a sequence.
+        InputError: when the value is something else.
     """
     if isinstance(value, str | bytes) or not isinstance(value, Sequence) or not all(isinstance(v, kind) for v in value):
         raise InputError(f"{what} must be a sequence of {kind.__name__}, got {_shown(value)}")
@@ -218,7 +217,7 @@ def sequence(value: Any, kind: type[T], what: str) -> tuple[T, ...]:
 
 
 def function(value: Any, what: str) -> Callable[..., Any]:
-    """Return ``value`` if it is callable.
+    """Return ``value`` unchanged if it is callable.
 
     Raises:
         InputError: when ``value`` is not callable.
@@ -233,7 +232,7 @@ def file_path(value: Any, what: str) -> Path:
     """Return ``value`` as a path.
 
     Raises:
-        InputError: when ``value`` is neither text nor a path, or contains a null character.
+        InputError: when ``value`` is not text or a path, or contains a null character.
     """
     name = os.fspath(value) if isinstance(value, str | os.PathLike) else None
     if not isinstance(name, str) or "\0" in name:

@@ -25,22 +25,22 @@ _WAVES = 4  # of the wobble
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    r"""A motion to demonstrate: a curve over the progress p, which is 0 at the start and 1 at the goal.
+    r"""A motion to demonstrate: a curve as a function of the progress p, from 0 at the start to 1 at the goal.
 
     A demonstration of the motion is the curve
 
     .. math:: x(p) = c(p) + (k - 1 + 0.15\, a)\, b(p) + \sum_{i=1}^2 (o_i + \beta_i)\, s_i(p) + \text{wobble}
 
-    Here, c is the ideal curve, and b a bend of the curve; a teacher with a curvature k above 1 exaggerates this bend.
-    The offset :math:`o_i` belongs to the teacher, and :math:`s_i` is the spread between repeats. The random numbers a
-    and :math:`\beta_i` differ from one repeat to the next. The wobble is a smooth random motion of the hand.
+    Here, c is the ideal curve, and b a bend of the curve. A teacher with a factor k above 1 exaggerates this bend. The
+    constants :math:`o_i` belong to the teacher, and :math:`s_i` is the spread between repeats. The random numbers a and
+    :math:`\beta_i` are different in each repeat. The wobble is a smooth random motion of the hand.
 
     Attributes:
         name: name of the task.
         curve: ideal positions c at n evenly spaced values of the progress, shape (n, 3) [m].
-        bend: displacement b by which a teacher with k = 2 exaggerates the bend, at the same values, shape (n, 3) [m].
-        spread: two displacements :math:`s_i` of one standard deviation, at the same values, shape (2, n, 3) [m]; 0
-            where the motion must be precise.
+        bend: displacement b that a teacher with k = 2 adds to the curve, at the same values, shape (n, 3) [m].
+        spread: two displacements :math:`s_i`, each one standard deviation of the demonstrations, at the same values,
+            shape (2, n, 3) [m]. The spread is 0 where the motion must be precise.
         free: axes along which the hand may wobble (1) or not (0), shape (3,).
         duration: duration for a teacher without habits [s].
     """
@@ -55,17 +55,17 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Habits:
-    r"""Habits of one teacher, which are the same in all demonstrations of this teacher.
+    r"""Habits of one teacher. They are the same in all demonstrations by this teacher.
 
     The progress is :math:`p = m(w(u))` of the fraction u of the duration, with the minimum-jerk profile
     :math:`m(w) = 10 w^3 - 15 w^4 + 6 w^5` and the warp :math:`w(u) = u + e\, u (1 - u) + h \sin(2 \pi u) / (2 \pi)`.
 
     Attributes:
-        pace: duration as a multiple of the motion's duration.
+        pace: duration of the teacher's demonstrations, divided by the motion's duration.
         eagerness: e, positive when the teacher is fast at first and slow towards the goal.
         hesitation: h, positive when the teacher is slow in the middle.
         curvature: factor k of the bends; above 1, the teacher exaggerates them.
-        offset: displacements :math:`o_i` in units of the motion's spread, shape (2,).
+        offset: constants :math:`o_i`, which displace the path in units of the motion's spread, shape (2,).
         noise: standard deviation of the wobble [m].
     """
 
@@ -91,7 +91,7 @@ class Habits:
         )
 
     def progress(self, u: Array) -> Array:
-        """Return the progress at the fractions ``u`` (n,) of the duration; it never decreases from 0 to 1."""
+        """Return the progress at the fractions ``u`` (n,) of the duration; the progress increases from 0 to 1."""
         w = u + self.eagerness * u * (1.0 - u) + self.hesitation * np.sin(2.0 * np.pi * u) / (2.0 * np.pi)
         return np.asarray(10 * w**3 - 15 * w**4 + 6 * w**5)
 
@@ -100,7 +100,7 @@ NO_HABITS = Habits()
 
 
 def s_shaped_reach(*, planar: bool) -> Motion:
-    """Return an S-shaped reach of 0.6 m, which is precise at both ends and varies between them.
+    """Return an S-shaped reach of 0.6 m. All repeats agree at both ends and differ between the ends.
 
     Args:
         planar: whether to keep the height constant, as in a task on a table.
@@ -124,7 +124,7 @@ def s_shaped_reach(*, planar: bool) -> Motion:
 
 
 def along(axis: int, values: Array) -> Array:
-    """Return displacements (n, 3) along the axis number ``axis`` with the components ``values`` (n,)."""
+    """Return displacements (n, 3) by ``values`` (n,) along x, y or z (``axis`` 0, 1 or 2)."""
     return np.eye(3)[axis] * values[:, None]
 
 
@@ -138,7 +138,7 @@ def demonstrate(
         habits: habits of the teacher.
         n_demonstrations: number of demonstrations.
         rng: random generator for the differences between the demonstrations.
-        source: name of the teacher; the demonstrations are numbered.
+        source: name of the teacher, which becomes the source of the demonstrations together with their number.
     """
     u = np.linspace(0.0, 1.0, _SAMPLES)
     p = habits.progress(u)
@@ -156,11 +156,13 @@ def demonstrate(
 
 
 def demonstrations_by(motion: Motion, teachers: int, *, repeats: int = REPEATS) -> list[Demonstration]:
-    """Return the demonstrations of several teachers; they differ in duration and speed, so align them before learning.
+    """Return the demonstrations of several teachers.
+
+    Align them before learning, because their durations and speeds differ.
 
     Args:
         motion: motion to demonstrate.
-        teachers: number of teachers; a single teacher is the same person as the first of several teachers.
+        teachers: number of teachers. The first teachers are the same for every number.
         repeats: number of demonstrations by each teacher.
 
     Raises:

@@ -71,7 +71,7 @@ class OpenBoxTask:
     """A Panda with a gripper reaches from one side of a table into an open box on the other side.
 
     Obstacles stand on the table between the start and the box. The task succeeds if the tool is at the goal inside the
-    box and nothing was touched. The simulator's geometry measures contact.
+    box and the arm has touched nothing. Contacts are measured with the simulator's geometry.
 
     Attributes:
         seed: seed of the obstacles.
@@ -149,7 +149,7 @@ class OpenBoxTask:
 
     @classmethod
     def obstacles(cls, rng: np.random.Generator, n_obstacles: int, path: Array | None = None) -> tuple[Obstacle, ...]:
-        """Return boxes, cylinders and cones that stand on the table, the first of them on a path.
+        """Return boxes, cylinders and cones that stand on the table. The first obstacle stands on a path.
 
         Args:
             rng: source of the random numbers.
@@ -179,7 +179,7 @@ class OpenBoxTask:
         raise InputError(f"OpenBoxTask: not enough space for {n_obstacles} obstacles; choose fewer")
 
     def world(self, arm: ArmModel) -> mujoco.MjSpec:
-        """Return the world without the box and the obstacles: arm and table."""
+        """Return the world with arm and table, but without the box and the obstacles."""
         spec = arm_world(arm)
         (x, y), size = _TABLE
         half = 0.5 * np.array(size)

@@ -55,8 +55,8 @@ class PackingTask:
     """A Sawyer with a gripper puts a cube into a moving packing box, while a bottle is pushed into the arm's way.
 
     The box slides back and forth on the table. At random times, the bottle is pushed from the side into the way of the
-    gripper, and later out of the way. The task succeeds if the cube rests in the box, and the arm has touched neither
-    the bottle nor the box.
+    gripper, and later out of the way. The task succeeds if the cube is in the box, and the arm has not touched the
+    bottle or the box.
 
     Attributes:
         seed: seed of the places and motions of cube, box and bottle.
@@ -114,7 +114,7 @@ class PackingTask:
         return np.array([x, y, 0.5 * _BOTTLE[1]])
 
     def release(self, scene: Scene) -> Pose | None:
-        """Return the pose of the tool above the middle of the box that is seen in a scene; None if no box is seen.
+        """Return the pose of the tool above the middle of the box in an observed scene; None if the scene has no box.
 
         The box is recognised by its name, or by its size if the sensor reports no names.
         """
@@ -126,7 +126,7 @@ class PackingTask:
         return None
 
     def truth(self) -> MovingScene:
-        """Return the true motion of the objects that a sensor can see: the box as one solid body, and the bottle."""
+        """Return the true motions of the box (as one solid body) and the bottle, which a sensor observes."""
         return MovingScene(
             Scene(None, (self._solid_box(0.0), self._bottle()), fixtures=packing_fixtures()),
             {BOX: lambda t: self._solid_box(t).pose.position, BOTTLE: self.bottle_at},
@@ -139,7 +139,7 @@ class PackingTask:
         return np.array([x + 2.0 * _THICK, y + 2.0 * _THICK, z + _THICK])
 
     def box_around(self, middle: Array) -> Box:
-        """Return the box as one solid body on the table, with its centre at ``middle``, x and y, shape (2,) [m]."""
+        """Return the box as one solid body on the table; ``middle`` is x and y of its centre, shape (2,) [m]."""
         center = np.array([*middle, 0.5 * self.rim])
         return Box(Pose(center, np.array([1.0, 0.0, 0.0, 0.0])), self.outer, name=BOX)
 
@@ -155,7 +155,8 @@ class PackingTask:
 
         Args:
             arm: the arm, if it has been loaded already.
-            control: control mode of the drives. The gripper touches the cube, so the default is computed torque.
+            control: control mode of the drives. The default is computed torque, which is compliant, because the gripper
+                touches the cube.
         """
         arm = self.arm() if arm is None else arm
         boards = open_box(Pose(self.box_at(0.0), np.array([1.0, 0.0, 0.0, 0.0])), _INSIDE, _THICK)
@@ -264,8 +265,8 @@ def reach(start: Array, goal: Array, rise: float) -> Motion:
 def packing_skills(teachers: int = 3) -> tuple[Skill, Skill]:
     """Return the two skills of the task, learned from synthetic teachers: reach the cube, and carry it over the box.
 
-    In the demonstrations, the cube and the box are in the middle of the areas in which they may be placed. In each run,
-    the goals therefore differ from the demonstrated goals.
+    In the demonstrations, the cube and the box are at their mean places. In a run, their places differ from these, and
+    so do the goals.
 
     Args:
         teachers: number of teachers, with eight demonstrations each.

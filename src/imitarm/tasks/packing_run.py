@@ -1,4 +1,4 @@
-"""run_packing: one run of the packing task with the policy RCAMO, a sensor, and a tracker of box and bottle."""
+"""run_packing: one run of the packing task with the policy RCAMO, a sensor, and a tracker for box and bottle."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def packing_policy(task: PackingTask, arm: ArmModel, grasp: Callable[[], Pose]) 
     Args:
         task: the task.
         arm: the arm with the gripper.
-        grasp: function that returns the pose of the tool in which the fingers close on the cube, from the latest known
+        grasp: function that returns the pose of the tool in which the fingers close on the cube. It uses the last known
             position of the cube.
     """
     reach, carry = packing_skills()
@@ -130,10 +130,10 @@ def exact(task: PackingTask, robot: SimulatedRobot) -> Callable[[float], Scene]:
 
 
 class PackingDetector(ObstacleDetector):
-    """Finds cube, bottle and box by their colours; the position of the box is computed from its rim.
+    """Finds cube, bottle and box by their colours, and computes the box's position from its rim.
 
-    An open box is not convex, so no convex shape fits its visible points. From above, all four sides of the rim are
-    visible. The middle of the rim is the middle of the box, whose size is known.
+    An open box is not convex, so the usual fit of convex shapes fails. The camera sees all four sides of the rim from
+    above. The middle of the rim is the middle of the box. The size of the box is known.
 
     Args:
         task: the task.
@@ -165,8 +165,8 @@ class PackingDetector(ObstacleDetector):
 class Watched:
     """Observes box and bottle with a depth camera that also measures colours; call it as ``observe(t)``.
 
-    The camera stands in front of the table. The robot waits for the first second, in which the camera observes the
-    scene. The cube is recognised by its colour. The cube is not an obstacle, because the gripper must reach it. While
+    The camera stands in front of the table. The camera observes the scene for one second before the robot starts to
+    move. The cube is recognised by its colour. The cube is not an obstacle, because the gripper must reach it. While
     the gripper hides the cube, its last measured position is used.
 
     Args:
@@ -201,7 +201,7 @@ class Watched:
         return replace(scene, obstacles=tuple(others))
 
     def grasp(self) -> Pose:
-        """Return the pose of the tool in which the fingers close on the cube, at the cube's last measured position."""
+        """Return the pose of the tool in which the fingers close on the cube at its last measured position."""
         return self._cube
 
 

@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 Observer = Callable[[MovingScene, SimulatedRobot, int], Callable[[float], Scene]]
 
 LINKS = 0.01
-"""Clearance that the safety filter keeps between the links and obstacles [m]."""
+"""Clearance that the safety filter keeps between the arm and obstacles [m]."""
 _TIME_CONSTANT = 1.5  # [s] of RCAMO
 _MAX_ACCELERATION = 4.0  # [m/s^2] of the brush of the Panda
 _TIMEOUT = 2.0  # longest duration over the learned duration
@@ -61,13 +61,13 @@ class _Push(NamedTuple):
 def pushed_cube(seed: int, skill: Skill) -> MovingScene:
     """Return a scene in which a cube is pushed onto the path of the sweep twice (thesis Fig 5.5).
 
-    The first push is onto the part of the path before the dirt, the second onto the part behind it, so that the cube
-    never moves the dirt. Size, side, places, times and speeds of the pushes are random. After each push, the cube
-    stands still on the path for some time, and is then pulled back.
+    The first push reaches the path before the dirt, the second push behind the dirt, so the cube never moves the dirt.
+    The size of the cube, the side from which it is pushed, and the places, times and speeds of the pushes are random.
+    After each push, the cube stands still on the path for some time, and is then pulled back.
 
     Args:
         seed: seed of the random numbers.
-        skill: the learned sweep; each push arrives shortly before the brush of the learned motion.
+        skill: the learned sweep. The cube arrives at the path shortly before the brush would on the learned path.
     """
     rng = np.random.default_rng([55, seed])
     side = rng.uniform(*_SIDES)
@@ -104,18 +104,20 @@ def _track(pushes: list[_Push], outside: list[Array], height: float) -> Track:
 
 @lru_cache(maxsize=1)
 def learned_sweep() -> Skill:
-    """Return the skill that is learned from the packaged demonstrations of the sweep."""
+    """Learn the sweep from the packaged demonstrations, and return the skill."""
     return Skill().fit(align(read(DEMONSTRATIONS)))
 
 
 def sweeping_rcamo(skill: Skill, task: SweepTask, *, max_acceleration: float) -> RCAMO:
-    """Return the policy RCAMO for the sweep: the brush stays on the table, and evades only to the left or right.
+    """Return the policy RCAMO for the sweep.
+
+    The brush stays on the table and avoids obstacles only to the left or right.
 
     Args:
         skill: the learned sweep.
         task: the task, with the radius of the brush and the required clearance.
-        max_acceleration: largest acceleration of the brush away from the learned path [m/s^2]. If the brush is faster
-            than the joints of the arm allow, it tilts and touches the table.
+        max_acceleration: largest acceleration of the brush away from the learned path [m/s^2]. If the joints of the arm
+            can't follow this acceleration, the brush tilts and touches the table.
     """
     return RCAMO(
         skill,

@@ -61,7 +61,7 @@ _PIPS = {
 
 @dataclass(frozen=True)
 class StackEvaluation:
-    """The evaluation of a stacking run.
+    """Success or failure of a stacking run.
 
     Attributes:
         success: whether all four cubes are stacked in order, without support by the gripper.
@@ -82,7 +82,7 @@ class CubeHistory:
 
     Attributes:
         highest: largest height of each cube's center so far, shape (4,) [m].
-        tallest: largest number of cubes in the tower so far, at times when the gripper touched no cube.
+        tallest: largest number of cubes in the tower so far, counted only while the gripper touched no cube.
         lost: indices of the cubes that left the gripper while they were in the air.
         held: index of the cube in the gripper; None if there is none.
     """
@@ -99,10 +99,10 @@ class StackTask:
 
     The colour and the dots of each cube show its number. Cube 1 stays in its place; cubes 2, 3 and 4 are stacked on
     cube 1 in this order. The task succeeds if the cubes stand in the order of their numbers, and the gripper does not
-    support them. Each cube must be centred on the cube below it to within the tolerance.
+    support them. Each cube must be centred on the cube below it, with an error of at most ``tolerance``.
 
-    Contacts use MuJoCo's elliptic friction cones with ``impratio`` 10, so that a grasped cube does not slip out of the
-    fingers. The setting ``condim`` 4 gives the finger pads torsional friction.
+    Contacts use MuJoCo's elliptic friction cones with ``impratio`` 10, because a grasped cube could otherwise slip out
+    of the fingers. The setting ``condim`` 4 gives the finger pads torsional friction.
 
     Attributes:
         seed: seed of the small random changes of the cubes' positions and rotations.
@@ -164,7 +164,7 @@ class StackTask:
         return np.array([robot.data.body(f"cube/{i + 1}").xpos for i in range(N_CUBES)])
 
     def stacked(self, robot: SimulatedRobot) -> int:
-        """Return the number of cubes in the tower, which begins with cube 1 on the table; 0 if cube 1 is not there."""
+        """Return the number of cubes in the tower on cube 1; 0 if cube 1 does not stand upright on the table."""
         cubes = self.cubes(robot)
         level = self._level(robot)
         for i in range(N_CUBES):
@@ -202,17 +202,17 @@ class StackTask:
             history.lost.add(before)
 
     def evaluate(self, robot: SimulatedRobot, history: CubeHistory) -> StackEvaluation:  # noqa: PLR0911 (one for each kind of failure)
-        """Return success, or the first failure that applies.
+        """Return success, or the first kind of failure that applies.
 
         Failures are checked in this order:
 
         * The robot has made a protective stop.
-        * The tower had more cubes before.
+        * The tower has lost a cube that was in it before.
         * A cube left the gripper in the air and is not in the tower.
         * A cube was put down outside the tower.
         * A cube that was never lifted turned over or was pushed.
-        * The next cube was never lifted.
-        * The time limit was reached without any of these failures.
+        * The next cube for the tower was never lifted.
+        * None of these failures applies: the time limit was reached.
         """
         n = self.stacked(robot)
         if self.standing(robot):

@@ -1,6 +1,6 @@
 """run_stack: one run of the stacking task with a simulated person, a camera, a retargeter and the simulated robot.
 
-``IdealFollower`` is the reference: a gripper that moves exactly with the true hand.
+``IdealFollower`` is a reference for comparison: its gripper follows the true hand without filters.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class RetargeterFactory(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class StackResult:
-    """The result of one run, as plain values that can be pickled.
+    """The result of one run; it can be pickled.
 
     Attributes:
         seed: seed of the person.
@@ -73,7 +73,7 @@ class StackResult:
         clamped: number of control steps in which the robot's limits changed the command.
         lengths: lengths of the person's upper arm and forearm, as measured before the run.
         skeletons: skeletons from the camera.
-        truth: true skeleton of each frame, also of frames that the camera lost.
+        truth: true skeletons at the times of all camera frames, including frames that the camera lost.
     """
 
     seed: int
@@ -97,7 +97,7 @@ class StackResult:
 
 
 def stack_correspondence(person: Person, lengths: LimbLengths | None = None) -> Correspondence:
-    """Return how this task relates the person to the robot: the scale is 1, and the gripper always points down."""
+    """Return the mapping from the person's motion to the robot's: the scale is 1, and the gripper points down."""
     lengths = LimbLengths(person.upper_arm, person.forearm) if lengths is None else lengths
     return Correspondence(lengths=lengths, orientation="fixed")
 
@@ -127,9 +127,9 @@ def run_stack(
 ) -> StackResult:
     """Let person number ``seed`` stack the cubes with a retargeter.
 
-    The loop runs 100 times per second. In each step, the retargeter receives the newest skeleton of the camera, the
-    robot receives the joint velocity of the retargeter, and the person sees the robot and the cubes. The person, the
-    positions of the cubes and the errors of the camera depend only on ``seed`` and ``repeat``. The person reacts to
+    The loop runs 100 times per second. In each step, the retargeter receives the newest skeleton from the camera. The
+    robot then receives a joint velocity from the retargeter, and the person sees the robot and the cubes. The person,
+    the positions of the cubes and the errors of the camera depend only on ``seed`` and ``repeat``. The person reacts to
     what the robot does, so the motion of the person also depends on the retargeter.
 
     Args:
@@ -137,10 +137,11 @@ def run_stack(
         repeat: number of the run of this person.
         factory: function that builds the retargeter.
         arm: model of the Sawyer with the gripper; None: the model is loaded here.
-        camera: function that builds the camera from a seed; the default camera has noise of 1 to 2 cm and all other
-            simulated errors.
+        camera: function that builds the camera from a seed. The default camera has noise of 1 to 2 cm and all other
+            errors that the simulation offers.
         latency: time from the exposure of a camera frame until its skeleton arrives [s].
-        control: control mode of the robot's drives; compliant by default, because contacts are expected.
+        control: control mode of the robot's drives. The default is computed torque, which is compliant, because the
+            gripper touches the cubes.
         timeout: longest duration [s].
 
     Raises:
@@ -269,9 +270,9 @@ class _StackRun:
 class IdealFollower(Retargeter):
     """A retargeter that moves the tool to its target by inverse kinematics, without filters or corrections.
 
-    This retargeter assumes that every skeleton is exact. With an :func:`ideal_camera`, the robot's tool moves like a
-    tool in the person's own hand, with a lag of a few hundredths of a second. The benchmark uses this retargeter to
-    record simulated people, and then gives the same recordings to every retargeter.
+    This retargeter assumes that every skeleton is exact. With an :func:`ideal_camera`, the robot's tool follows the
+    person's hand with a lag of a few hundredths of a second. The benchmark records simulated people who work with this
+    retargeter, and gives these recordings to every retargeter.
     """
 
     name: ClassVar[str] = "ideal"

@@ -1,8 +1,7 @@
 r"""SimulatedOperator: a simulated person who stacks cubes with a teleoperated robot and watches gripper and cubes.
 
-Because the person reacts to the robot, person and retargeter form a closed loop. The operator sees gripper and cubes
-with delay and noise, and reacts with a motion of the hand. The operator does not know the retargeter between hand and
-gripper.
+The operator (the simulated person) sees gripper and cubes with delay and noise, and reacts with a motion of the hand.
+Operator and retargeter therefore form a closed loop. The operator behaves in the same way with every retargeter.
 """
 
 from __future__ import annotations
@@ -64,22 +63,22 @@ class OperatorView:
 
 @dataclass(frozen=True)
 class Habits:
-    """Habits of a person in this task, which differ from person to person.
+    """Habits of one person in this task.
 
     Attributes:
-        delay: time from seeing an error to the start of the corrective movement [s]; about 0.2 s for a visual
-            correction.
-        look_every: time between two looks at the gripper, each of which may lead to a correction [s].
+        delay: reaction time, from seeing an error to the start of the corrective movement, about 0.2 [s].
+        look_every: mean time between two looks at the gripper [s]. Each look may lead to a correction.
         gain: fraction of a small error that one correction removes, below 1.
-        noise: standard deviation of the error of observed positions on each axis; a new error is drawn at each look
-            [m].
+        noise: standard deviation of the random error of observed positions along each axis [m]. Each look has another
+            error.
         bias: constant error of the observed position of the gripper, 3 values [m].
         speed: mean speed of the hand over long distances [m/s].
         fine_speed: mean speed of the hand near a contact [m/s].
-        tolerance: largest error at which the gripper looks aligned, so that the hand closes or opens [m].
-        sense_of_lag: lag with which the person expects the robot to follow the hand, the same for every retargeter [s].
-        dwell: rest after the hand has closed or opened [s].
-        height: additional height of movements over long distances [m].
+        tolerance: largest position error at which the person considers the gripper aligned, and closes or opens the
+            hand [m].
+        sense_of_lag: lag that the person expects between hand and robot, the same for every retargeter [s].
+        dwell: time for which the hand rests after it has closed or opened [s].
+        height: height by which the hand rises additionally in movements over long distances [m].
         begin: duration for which the person first holds the hand still, so that the robot can begin to follow [s].
     """
 
@@ -141,7 +140,7 @@ class Phase(StrEnum):
 
 
 class StackPlan:
-    """The operator's decisions: where the gripper should go next, and when the hand closes or opens.
+    """Decides where the operator wants the gripper to go next, and when the hand closes or opens.
 
     Attributes:
         phase: current phase.
@@ -168,10 +167,10 @@ class StackPlan:
         }
 
     def step(self, view: OperatorView, now: float) -> tuple[Array | None, bool]:
-        """Return the goal of the gripper (3,) [m] (None: keep the hand at rest), and whether to move carefully.
+        """Return the goal of the gripper (3,) [m], or None to keep the hand at rest, and whether to move carefully.
 
         Args:
-            view: the operator's view, with delay and noise.
+            view: what the operator saw, with delay and noise.
             now: time at which the reaction starts [s].
         """
         self._view, self._now = view, now
@@ -348,31 +347,31 @@ class _SubMovement:
 
 
 class SimulatedOperator:
-    r"""A simulated person who stacks cubes with a robot and watches the gripper instead of the hand.
+    r"""A simulated person who stacks cubes with a robot and watches the gripper, not the hand.
 
     *Hand.* The motion of the hand is a sum of sub-movements, :math:`h(t) = h_0 + \sum_i d_i\,\mu((t-t_i)/T_i)`, with
     the minimum-jerk profile :math:`\mu(u) = 10u^3-15u^4+6u^5` (intermittent control: Milner 1992, Burdet and Milner
-    1998). The lengths of the sub-movements vary randomly by 4 %. A sub-movement lasts :math:`T = |d|/v + 0.25` s, with
-    a low speed v near a contact. Tremor is added by :class:`~imitarm.capture.person.Person`.
+    1998). The lengths of the sub-movements vary randomly by 4 %. A sub-movement over the distance :math:`|d|` lasts
+    :math:`T = |d|/v + 0.25` s. The speed v is low near a contact. Tremor is added by
+    :class:`~imitarm.capture.person.Person`.
 
     *Eye.* About 7 times per second, the person reacts to an :class:`OperatorView` that is ``delay`` old. The observed
-    positions have a bias, and noise of about a millimetre. The person extrapolates the observed position by the
-    displacement that the hand has commanded since the time of the view, and so expects the gripper at :math:`\hat p =
-    p(t-\delta) + \rho\,(h_{end} - h(t-\delta-\lambda))`. In this equation, :math:`\delta` is ``delay``, :math:`h_{end}`
-    is the hand's position after all commanded sub-movements, and :math:`\rho` and :math:`\lambda` are the scale and the
-    lag that the person expects. The next sub-movement of the hand is :math:`d = g\,(p_{goal}-\hat p)/\rho`. The gain g
-    is below 1 over short distances and 1 over long distances.
+    positions have a bias, and noise of about a millimetre. Since the time of the view, the hand has moved. The person
+    therefore expects the gripper at :math:`\hat p = p(t-\delta) + \rho\,(h_{end} - h(t-\delta-\lambda))`. In this
+    equation, p is the observed position, :math:`\delta` is ``delay``, and :math:`h_{end}` is the hand's position after
+    all sub-movements that have begun. The person expects the scale :math:`\rho` and the lag :math:`\lambda` between
+    hand and gripper. The next sub-movement of the hand is :math:`d = g\,(p_{goal}-\hat p)/\rho`. The gain g is below 1
+    over short distances and 1 over long distances.
 
-    *Plan.* :class:`StackPlan` chooses the goals. The hand closes or opens when the gripper looks aligned to within the
-    person's tolerance, which grows as the person becomes impatient. If the gripper misses or loses a cube, or a cube
-    falls, the person fetches the cube again.
+    *Plan.* :class:`StackPlan` chooses the goals. The hand closes or opens when the error of the gripper appears to be
+    within the person's tolerance. The tolerance grows with the time that the person needs for the current phase. If the
+    gripper misses or loses a cube, or a cube falls, the person fetches the cube again.
 
-    The hand position depends only on views that are at least ``delay`` old.
 
     Args:
         seed: seed of the person and the habits.
-        repeat: number of this person's run. Different numbers make the runs of one person differ.
-        scale: the ratio of robot motion to hand motion, as the person expects it.
+        repeat: number of the run; it makes the runs of one person differ from each other.
+        scale: ratio of robot motion to hand motion that the person expects.
 
     Attributes:
         person: model of the person's body and arm motion.

@@ -62,8 +62,8 @@ class SweepTask:
 
     The brush starts at the point S, moves to the dirt at the point T, and pushes the dirt to the point G in the
     dustpan. The brush moves just above the table. The open side of the brush points in the direction of motion. The two
-    ends of the brush therefore keep the crumbs in when the brush moves to the left or right. The task succeeds if the
-    dirt is in the pan and neither the arm nor the brush has touched an obstacle.
+    ends of the curved brush therefore keep the crumbs inside when the brush moves to the left or right. The task
+    succeeds if the dirt is in the pan and the arm with its brush has not touched an obstacle.
 
     Attributes:
         seed: seed of the positions of the crumbs.
@@ -99,7 +99,7 @@ class SweepTask:
 
     @staticmethod
     def scene(name: str) -> Scene:
-        """Return the packaged scene ``name``, one of :data:`SCENES`; or "T1" to "T8", as the thesis numbers its tasks.
+        """Return a packaged scene; ``name`` is one of :data:`SCENES`, or "T1" to "T8", the numbers in thesis Table 4.1.
 
         Raises:
             UnknownNameError: when there is no such scene.
@@ -113,7 +113,7 @@ class SweepTask:
 
     @staticmethod
     def moving_scene(name: str) -> MovingScene:
-        """Return the packaged scene ``name``, one of :data:`MOVING_SCENES`, whose obstacles follow tracks.
+        """Return a packaged scene with moving obstacles; ``name`` is one of :data:`MOVING_SCENES`.
 
         Raises:
             UnknownNameError: when there is no such scene.
@@ -126,14 +126,14 @@ class SweepTask:
 
     @classmethod
     def scenes(cls) -> Mapping[str, Scene]:
-        """Return all packaged scenes by name, the scene without obstacles first."""
+        """Return all packaged scenes with obstacles at rest, by name; the first scene has no obstacles."""
         return {name: cls.scene(name) for name in SCENES}
 
     @classmethod
     def motion(cls) -> Motion:
         """Return the sweep that teachers with habits demonstrate: over the dirt into the pan, at constant height.
 
-        The motion is precise at the start, at the dirt and at the goal. Between these three places, teachers bend the
+        The motion is precise at the start, at the dirt and at the goal. Between these three points, teachers bend the
         path to the left or to the right.
         """
         start, dirt, goal = (pose.position for pose in (cls.start, cls.dirt, cls.goal))
@@ -156,7 +156,7 @@ class SweepTask:
     def dirt_time(self, trajectory: Trajectory) -> float:
         """Return the time at which ``trajectory`` is nearest to the dirt [s].
 
-        The path should not be displaced at this time, because the brush must meet the dirt.
+        A policy should not displace the path at this time, because the brush must meet the dirt.
         """
         away = np.linalg.norm(trajectory.positions - self.dirt.position, axis=1)
         return float(trajectory.times[np.argmin(away)])
@@ -227,7 +227,7 @@ class SweepTask:
 
 
 def table_top() -> Box:
-    """Return the table top as a box, because the table has edges, past which a camera sees the floor."""
+    """Return the table top as a box of finite size; beyond its edges, a camera sees the floor."""
     place = Pose(np.array([*TABLE_CENTER, -0.5 * TABLE_SIZE[2]]), np.array([1.0, 0.0, 0.0, 0.0]))
     return Box(place, np.array(TABLE_SIZE), name="table")
 

@@ -39,12 +39,11 @@ class Teacher:
 
     The hand moves from the start S over the dirt T to the goal G (see :class:`~imitarm.tasks.sweep.SweepTask`). Its
     path is the minimum-jerk path through S, T, G and two points between them: the quintic spline that starts and ends
-    at rest (Flash and Hogan 1985). Persons differ in many respects: total duration, time until T, sideways displacement
-    of the path, accuracy at T and G, height of the brush, rotation of the wrist, tremor, and rest before and after the
-    motion.
+    at rest (Flash and Hogan 1985). Persons differ in the timing of the motion, the sideways displacement of the path,
+    and the accuracy at T and G. They also differ in the height of the brush, the rotation of the wrist, and the tremor.
 
     Attributes:
-        seed: seed of the person, which determines all these quantities.
+        seed: seed from which these differences are drawn.
         duration: duration of the motion [s].
         rest: time at rest before and after the motion, shape (2,) [s].
     """
@@ -58,7 +57,7 @@ class Teacher:
 
     @classmethod
     def from_seed(cls, seed: int) -> Teacher:
-        """Return a person whose quantities are drawn at random with the seed ``seed``."""
+        """Return the person with this seed."""
         rng = np.random.default_rng([20240, seed])
         start, dirt, goal = (pose.position for pose in (SweepTask.start, SweepTask.dirt, SweepTask.goal))
         duration = rng.uniform(9.0, 12.0)
@@ -96,7 +95,7 @@ class Teacher:
         return Pose(position, quaternion), np.concatenate([self._path(t, 1), self._wrist(t, 1)])
 
     def demonstrate(self, arm: ArmModel | None = None) -> tuple[Demonstration, SimulatedRobot]:
-        """Guide the arm through the sweep; return the demonstration and the robot with its crumbs.
+        """Guide the arm through the sweep; return the demonstration and the simulated robot at the end.
 
         The hand pulls the tool like a spring and a damper, ``f = K (x_hand - x) + D (v_hand - v)``, and acts on the
         tool's rotation in the same way. The arm compensates its own weight and follows the hand. The demonstration

@@ -60,7 +60,10 @@ def looking_at(eye: ArrayLike, target: ArrayLike) -> Pose:
 
 
 def watch(robot: SimulatedRobot, observe: Callable[[float], Scene]) -> None:
-    """Let the robot stand still for one second, and call ``observe`` with the times from -1 s to 0 s."""
+    """Let the robot stand still for one second.
+
+    Call ``observe`` in each control period, with times from -1 s to 0 s.
+    """
     start = robot.time + WATCHES
     while robot.time < start - 0.5 * PERIOD:
         observe(robot.time - start)
@@ -68,7 +71,7 @@ def watch(robot: SimulatedRobot, observe: Callable[[float], Scene]) -> None:
 
 
 def delayed(truth: MovingScene) -> MovingScene:
-    """Return the scene with all motions delayed by one second, the time for which the camera watches first."""
+    """Return the scene with all motions delayed by the second in which the camera watches and the arm rests."""
     motions = {key: lambda time, motion=motion: motion(time - WATCHES) for key, motion in truth.motions.items()}
     return MovingScene(replace(truth.scene.at(truth.scene.stamp - WATCHES), stamp=truth.scene.stamp), motions)
 
@@ -86,18 +89,18 @@ def watched(
 ) -> CameraObserver:
     """Observe the scene for one second with a depth camera, and return the function ``observe`` of a control loop.
 
-    A detector finds the obstacles in the images of the camera, and a tracker follows them. The scene must be
-    :func:`delayed`.
+    A detector finds the obstacles in the images of the camera, and a tracker follows them. Delay the motions of the
+    robot's scene with :func:`delayed` first.
 
     Args:
         robot: the simulated robot, at rest.
         eye: position of the camera in the base frame, shape (3,) [m].
         middle: point at which the camera looks, in the base frame, shape (3,) [m].
         workspace: lowest and highest corner of the box in which obstacles are searched, shape (2, 3) [m].
-        surfaces: known surfaces, which are not obstacles. They must not be larger than the surfaces in the simulated
-            world.
-        goal: goal of the observed scenes.
-        fixtures: fixtures of the observed scenes.
+        surfaces: known surfaces, such as the table top, which the detector must not report as obstacles. They must not
+            be larger than in the simulated world.
+        goal: goal that the observed scenes contain.
+        fixtures: fixtures that the observed scenes contain.
         seed: seed of the camera's noise.
     """
     observe = CameraObserver(

@@ -41,7 +41,8 @@ class StepInfo:
         skeleton: newest skeleton that arrived in this step; None if no skeleton arrived.
         command: command that the retargeter computed.
         state: measured state of the robot.
-        engagement: state of the retargeter; None while the robot cannot be controlled.
+        engagement: whether the retargeter waits, follows, coasts, holds or is stopped; None while the robot cannot be
+            controlled.
         problem: why the robot cannot be controlled; empty if it can be controlled.
     """
 
@@ -62,11 +63,12 @@ class Summary:
         steps: number of control steps.
         overruns: number of control steps that were skipped because the computer was busy.
         skeletons: number of skeletons that the retargeter processed.
-        engagement: number of steps that the retargeter spent in each of its states.
+        engagement: number of steps that the retargeter spent in each state (waiting, following, coasting, holding,
+            stopped).
         interrupted: number of steps in which the robot could not be controlled.
         clamped: for each limit of the robot, the number of steps in which this limit changed the command.
         filtered: number of steps in which the safety filter changed the command.
-        unsafe: number of steps in which no joint velocity could satisfy all limits and clearances.
+        unsafe: number of steps in which no joint velocity could keep all limits and clearances.
         speed: largest joint velocity of the set-point, as a fraction of the joint's velocity limit.
         acceleration: largest joint acceleration of the set-point, as a fraction of the joint's acceleration limit.
         interruptions: number of times that control of the robot was lost.
@@ -93,23 +95,22 @@ class Summary:
 class Teleoperation:
     """Lets a person move a robot in real time, at the retargeter's control period.
 
-    In each period, the retargeter turns the newest skeleton into a joint velocity, the safety filter corrects this
-    velocity, and :meth:`Robot.move <imitarm.robots.robot.Robot.move>` sends it to the robot. At times, the robot cannot
-    be controlled, because it was stopped, was slowed down or does not answer. When control returns, the robot is first
-    brought to rest. The retargeter then starts again from the arm's current position, so the arm never jumps.
+    In each period, the retargeter computes a joint velocity from the newest skeleton. The safety filter corrects this
+    velocity, and :meth:`Robot.move <imitarm.robots.robot.Robot.move>` sends it to the robot. While the robot is
+    stopped, slows down or does not answer, it cannot be controlled. When control returns, the robot is first brought to
+    rest. The retargeter then starts again from the arm's current position, so the arm never jumps.
 
     Args:
         source: skeletons of one person, live or replayed in real time.
         retargeter: method that converts the motion of the person's arm to the robot's motion.
         robot: robot to control.
-        safety: safety filter that checks every command; None: the default filter, which keeps the arm within its
-            limits, its links at least 10 mm apart, and the arm out of contact with the obstacles of the retargeter's
-            scene.
+        safety: safety filter that checks every command. None: a filter that keeps the arm within its limits, its links
+            at least 10 mm apart, and the arm out of contact with the obstacles of the retargeter's scene.
         stream: UDP stream from which ``source`` reads, used to measure latencies; None: ``source`` reads no UDP stream.
-        recorder: records the robot's motion, beginning when a person first moves the robot; None: no recording.
-        confirm_enable: function called as ``confirm_enable(reason, stopped)`` in each step in which a robot on a server
-            cannot be controlled. The function returns whether the robot may be enabled. If ``confirm_enable`` is None,
-            the robot is never enabled again.
+        recorder: records the robot's motion from the time when the person first moves the robot; None: no recording.
+        confirm_enable: function that decides whether a robot on a server may be enabled again. It is called as
+            ``confirm_enable(reason, stopped)`` in each step in which the robot cannot be controlled. It returns True or
+            False. None: the robot is not enabled again.
         on_step: function called after every step.
         clock_ns: function that returns the time [ns], on the same clock as ``stream`` and ``robot``.
         rate_limiter: timer that starts the control steps; None: a timer in real time.

@@ -1,9 +1,8 @@
 """Datagrams: messages encoded as bytes, and decoded with every value checked.
 
-A datagram consists of a header of 28 bytes and a payload, both little-endian. The message type alone determines the
-size of the payload; docs/transmission.md has a table of the fields. An invalid datagram is rejected with a reason. No
-part of a datagram is executed or used as a length. The only effect of a hostile datagram is therefore that a counter
-increases.
+A datagram consists of a header of 28 bytes and a payload, both little-endian. The message type determines the size of
+the payload; docs/transmission.md has a table of the fields. An invalid datagram is rejected with a reason. No part of a
+datagram is executed or used as a length, so a hostile datagram has no effect except that a counter increases.
 """
 
 from __future__ import annotations
@@ -26,10 +25,10 @@ _CLOCK: int | None = getattr(time, "CLOCK_BOOTTIME", None)
 
 
 def now_ns() -> int:
-    """Return the current time [ns] of a monotonic clock that all processes of this machine share.
+    """Return the current time [ns] of a clock that never goes back and that all processes of this machine share.
 
-    If the operating system allows it, the clock keeps running while the machine is suspended. If the clock stopped
-    during a suspension, every datagram sent by this machine after the suspension would look delayed to its receiver.
+    If the operating system offers such a clock, it also runs while the machine is suspended. A clock that stops during
+    a suspension would make every later datagram of this machine look delayed to its receiver.
     """
     return time.clock_gettime_ns(_CLOCK) if _CLOCK is not None else time.monotonic_ns()
 
@@ -42,7 +41,7 @@ class Header:
         kind: number of the message type.
         flags: bits whose meaning depends on the message type.
         session: random number that the sender draws when it starts, u32.
-        sequence: sequence number of the datagram within the session, u32; wraps around.
+        sequence: sequence number of the datagram within the session, u32; after the largest number follows 0.
         time_ns: time of sending, on the sender's clock, u64 [ns].
     """
 
@@ -57,8 +56,8 @@ class Encoder:
     """Encodes messages as the numbered and time-stamped datagrams of one session.
 
     Args:
-        session: session number; None: a random number other than 0, by which receivers recognize that a sender has
-            restarted.
+        session: session number; None: a random number other than 0. From a new number, receivers recognise that the
+            sender has restarted.
         first: first sequence number.
     """
 

@@ -31,7 +31,7 @@ DROP_REASONS = {
     "foreign": "from a second sender, while the first is still active",
     "retired": "from a sender that has been replaced by another",
 }
-"""Reasons for dropping a datagram: the keys under which dropped datagrams are counted, and their meanings."""
+"""Reasons for dropping a datagram: the keys of the counters of dropped datagrams, and their meanings."""
 
 _HALF = 2**31
 _MASK = 2**32 - 1
@@ -64,19 +64,19 @@ class ClockOffsetEstimator:
     over the last one to two minutes is therefore the clock offset plus the shortest travel time. The difference between
     a datagram's sample and this minimum is the delay of the datagram.
 
-    One false time stamp in the future would lower the minimum and make all other datagrams look delayed. A sample that
-    lies more than ``max_age / 2`` below the confirmed minimum is therefore *unconfirmed* until a datagram that was sent
-    later gives a similar sample. An unconfirmed sample lowers the minimum at once, so that no delayed datagram looks
-    fresh.
+    One false time stamp in the future would lower the minimum and make all other datagrams look delayed. Therefore, a
+    sample more than ``max_age / 2`` below the confirmed minimum is at first *unconfirmed*. It becomes confirmed when a
+    later datagram gives a similar sample. Even an unconfirmed sample lowers the minimum at once, so that no delayed
+    datagram is accepted as recent.
 
     An unconfirmed sample is rejected as a false time stamp in two cases:
 
     * Two datagrams that arrive after the sample have earlier time stamps than the sample, although a sender's clock
       never goes back.
-    * The datagrams before and after the sample agree with the confirmed minimum: three earlier datagrams gave samples
-      near this minimum, and three later datagrams, which arrive over a period of at least ``max_age``, have a delay of
-      at most ``max_age`` relative to this minimum. This case applies only while at most four samples are unconfirmed,
-      because more unconfirmed samples are a sign that all other datagrams were delayed in a queue.
+    * The datagrams before and after the sample agree with the confirmed minimum. Three earlier datagrams gave samples
+      near this minimum. Three later datagrams, which arrive over a period of at least ``max_age``, have a delay of at
+      most ``max_age`` relative to this minimum. This case applies only while at most four samples are unconfirmed. With
+      more unconfirmed samples, it is likely that the other datagrams were delayed in a queue.
 
     Args:
         max_age: longest accepted delay [ns].
@@ -98,7 +98,7 @@ class ClockOffsetEstimator:
     def too_early(self, offset: int, sent: int, now: int) -> bool:
         """Return whether a time stamp lies more than ``10 * max_age`` in the future.
 
-        The sample of such a datagram is used only if the next datagram has an even later time stamp.
+        The sample of such a datagram is used only if the time stamp of the next datagram is later still.
 
         Args:
             offset: time of receiving minus time stamp [ns].
@@ -179,7 +179,7 @@ class DatagramFilter:
     *Delay.* The clocks of two machines are not synchronized. The delay of a datagram is therefore measured relative to
     the fastest datagram of the last one to two minutes (:class:`ClockOffsetEstimator`).
 
-    *Sessions.* A sender that restarts begins a new session. The new session is accepted once the previous session has
+    *Sessions.* A sender that restarts begins a new session. The new session is accepted when the previous session has
     been silent for ``session_timeout``. Therefore, the datagrams of two senders are never mixed. A session that was
     replaced is never accepted again.
 

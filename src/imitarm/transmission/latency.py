@@ -25,14 +25,14 @@ STAGES = {
 }
 """Processing stages of a skeleton, in order, with the interval that each stage covers.
 
-Between two machines, the travel time of a datagram is measured relative to the travel time of the fastest datagram.
+If the processes run on two machines, a datagram's travel time is counted from that of the fastest datagram.
 """
 
 _CHUNK = 1024
 
 
 class LatencyLog:
-    """A table with one row for each skeleton and one column for each stage; nan where a duration was not measured.
+    """A table of durations, with a row for each skeleton and a column for each stage; unmeasured durations are nan.
 
     Args:
         stages: names of the columns.
@@ -87,7 +87,7 @@ class LatencyLog:
         return rows
 
     def save(self, path: str | Path) -> None:
-        """Write the log as a table: number of the skeleton, then the duration of each stage [s].
+        """Write the log as a CSV table: the number of the skeleton, then the duration of each stage [s].
 
         Raises:
             InputError: when the file cannot be written.

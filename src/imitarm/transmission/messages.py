@@ -23,7 +23,7 @@ _MAX_WAIT = 60_000_000_000  # [ns]
 
 
 class DatagramError(InputError):
-    """Raised for bytes that are not a valid datagram; ``reason`` is the key under which such bytes are counted."""
+    """The bytes are not a valid datagram; ``reason`` is the key under which the receiver counts them."""
 
     def __init__(self, reason: str, what: str) -> None:
         super().__init__(f"datagram: {what}")
@@ -54,10 +54,11 @@ class SkeletonFrame:
 
     Attributes:
         time: time of exposure, on the source's clock [s].
-        positions: positions of the joints in the sensor's frame, shape (25, 3) [m]; each coordinate is at most 20 m,
-            and 0 for a lost joint.
-        tracking: tracking state of each joint: 0 lost, 1 inferred, 2 tracked, shape (25,).
-        hands: states of the left and the right hand, 0 to 4.
+        positions: positions of the joints in the sensor's frame, shape (25, 3) [m]. Each coordinate is between -20 and
+            20 m. The coordinates of a lost joint are 0.
+        tracking: tracking state of each joint (0 lost, 1 inferred, 2 tracked), shape (25,).
+        hands: states of the left and the right hand, numbers of :class:`~imitarm.capture.skeleton.HandState`, shape
+            (2,).
         person: identifier of the person, u64.
         waited_ns: time from exposure to sending [ns]; at most one minute.
     """
@@ -101,9 +102,9 @@ class JointCommand:
     Attributes:
         mode: kind of command.
         q: commanded joint positions, shape (n_joints,) [rad]; at most 16 joints.
-        velocity: joint velocities with which the arm should pass the positions ``q``, shape (n_joints,) [rad/s].
-        arm: fingerprint of the arm model for which the command was computed.
-        challenge: for ENABLE, the challenge number that the stopped robot sent; otherwise 0.
+        velocity: joint velocities that the arm should have at the positions ``q``, shape (n_joints,) [rad/s].
+        arm: checksum of the arm model for which the command was computed (:func:`imitarm.robots.server.fingerprint`).
+        challenge: for an ENABLE command, the number that the stopped robot has sent; for other commands, 0.
         opening: commanded opening of the gripper [m], at most 1 m; None: the opening does not change.
     """
 
@@ -153,10 +154,10 @@ class JointState:
         torque: torques of the joint drives, shape (n_joints,) [N m].
         set_point: joint positions that the drives track, shape (n_joints,) [rad].
         set_velocity: velocity of the set-point, shape (n_joints,) [rad/s].
-        arm: fingerprint of the arm model that the robot uses.
+        arm: checksum of the arm model that the robot uses.
         challenge: number that an ENABLE command must contain; 0 if the robot is not stopped.
         owner: session of the client whose commands the robot follows; 0 if it follows no client.
-        opening: opening of the gripper and its maximum [m]; None without a gripper.
+        opening: current and largest opening of the gripper [m]; None without a gripper.
         echo: sequence number of the last command that the robot followed.
         echo_sent_ns: time at which the client sent command ``echo``, on the client's clock [ns].
         received_ns: time at which the robot received command ``echo``, on the robot's clock [ns].
@@ -222,7 +223,7 @@ Message = SkeletonFrame | JointCommand | JointState
 KINDS: dict[int, type[SkeletonFrame] | type[JointCommand] | type[JointState]] = {
     kind.KIND: kind for kind in (SkeletonFrame, JointCommand, JointState)
 }
-"""Each message type, by its number in the header of a datagram."""
+"""The message types, by their numbers in the header of a datagram."""
 
 
 def _magnitude(values: Array) -> float:

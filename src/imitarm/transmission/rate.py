@@ -11,8 +11,9 @@ from imitarm.validation import finite_number
 class RateLimiter:
     """Starts control periods on a fixed schedule, at whole multiples of the period after the first start.
 
-    If a period starts late by one period or more, the missed periods are skipped and counted, and the following periods
-    start on schedule. Running the missed periods later, in a burst, would move an arm faster than intended.
+    If the loop is late by one period or more, it has missed periods. The limiter skips and counts these periods, and
+    the following periods start on schedule. If the missed periods were run later in quick succession, an arm would move
+    faster than intended.
 
     Args:
         period: length of a period [s].
@@ -20,7 +21,7 @@ class RateLimiter:
         sleep: function that waits for a time [s].
 
     Attributes:
-        ticks: number of periods so far, including missed periods.
+        ticks: number of periods since the first start, including missed periods.
         overruns: number of missed periods.
 
     Raises:

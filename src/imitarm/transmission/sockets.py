@@ -21,10 +21,10 @@ def parse_address(text: str, *, host: str = LOOPBACK) -> Address:
 
     Args:
         text: text typed by a user.
-        host: host to use when only a port is given.
+        host: host to return if ``text`` contains only a port.
 
     Raises:
-        InputError: when the text is neither ``HOST:PORT`` nor ``PORT``.
+        InputError: when the text does not have one of these two forms.
     """
     name, colon, port = text.rpartition(":")
     if (colon and not name) or not port.isdecimal() or not 0 < int(port) < 65536:
@@ -82,12 +82,14 @@ def connected(address: Address) -> socket.socket:
         one.close()
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{address[0]}:{address[1]}: no route to this address ({error.strerror or error})") from error
+        raise InputError(
+            f"{address[0]}:{address[1]}: no route to this address ({error.strerror or error}); check the network"
+        ) from error
     return one
 
 
 def waiting(one: socket.socket, most: int = _AT_ONCE) -> Iterator[tuple[bytes, Address]]:
-    """Yield at most ``most`` datagrams that have already arrived, each with its sender's address; never wait."""
+    """Yield the datagrams that have already arrived, at most ``most``, with their senders' addresses; never wait."""
     for _ in range(most):
         try:
             yield one.recvfrom(_LARGEST)

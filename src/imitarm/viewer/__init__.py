@@ -1,9 +1,9 @@
 """Drawing: 3-D playback, figures, and reports; a report is one HTML page that opens offline.
 
-``FrameRecorder`` records a simulation while it runs. ``SceneResult``, ``LearningSummary`` and ``Report`` hold the
-results, and ``write_report`` writes the page. :mod:`imitarm.viewer.retarget_report` writes the report on a retargeted
-motion. :func:`imitarm.plot` draws one object. The packages viser, matplotlib and jinja2 are imported only when
-something is drawn.
+``FrameRecorder`` records a simulation while it runs. ``Report`` holds the results (``SceneResult``,
+``LearningSummary``), and ``write_report`` writes the page. :mod:`imitarm.viewer.retarget_report` writes the report on a
+retargeted motion. :func:`imitarm.plot` draws a single trajectory, skill, scene or other object. The packages viser,
+matplotlib and jinja2 are imported only when something is drawn.
 """
 
 from __future__ import annotations

@@ -53,9 +53,9 @@ _STYLE: Final[Mapping[str, Any]] = {
 
 
 class Canvas:
-    """A matplotlib figure to draw on; when the drawing is finished, ``svg`` contains its SVG text.
+    """A matplotlib figure to draw on. When the drawing is finished, the attribute ``svg`` contains its SVG text.
 
-    Margins are given in inches, because an automatic layout would draw every figure twice.
+    The positions of axes are given in inches, because an automatic layout would draw every figure twice.
     """
 
     def __init__(self, figure: Any, size: tuple[float, float]) -> None:
@@ -63,7 +63,7 @@ class Canvas:
         self.svg = ""
 
     def axes(self, left: float, bottom: float, right: float, top: float, **options: Any) -> Any:
-        """Return axes. The arguments are the positions of their edges, from the figure's lower left corner [inch]."""
+        """Return axes whose edges have these distances from the left or lower edge of the figure [inch]."""
         width, height = self.size
         return self.figure.add_axes(
             (left / width, bottom / height, (right - left) / width, (top - bottom) / height), **options
@@ -120,7 +120,7 @@ def thin(n: int, most: int = POINTS) -> NDArray[np.int64]:
 
 
 def thin_extremes(values: Array, most: int = POINTS) -> NDArray[np.int64]:
-    """Return indices of samples to draw; every short interval keeps its minimum and maximum, so no peak is lost."""
+    """Return about ``most`` indices of samples to draw. Every short interval keeps its minimum and maximum."""
     if len(values) <= most:
         return np.arange(len(values))
     stretches = np.array_split(np.arange(len(values)), most // 2)

@@ -1,4 +1,4 @@
-"""Charts of a report: time series, displacements of components, choice of the number of components, joint charts.
+"""Charts of a report: quantities over time, displacements of components, and the choice of their number.
 
 Every function returns one ``<svg>`` element. Figures of paths are in :mod:`~imitarm.viewer.maps`.
 """
@@ -33,7 +33,7 @@ def clearance(times: ArrayLike, distances: ArrayLike, required: float, *, name: 
         name: name of the figure, unique in the page.
 
     Returns:
-        An SVG element; an empty string when no distance is finite, because there was no obstacle.
+        An SVG element; an empty string if there was no obstacle (no distance is finite).
     """
     t, d = np.asarray(times, dtype=float), MM * np.asarray(distances, dtype=float)
     finite = np.isfinite(d)
@@ -103,7 +103,10 @@ def torques(
 
 
 def short_names(names: Sequence[str]) -> list[str]:
-    """Return joint names that fit above a small chart; if one is too long, a common prefix up to "_" is removed."""
+    """Return joint names that fit above a small chart.
+
+    If a name is too long, the common prefix up to "_" is removed.
+    """
     first, _, _ = min(names, default="").rpartition("_")
     shared = f"{first}_" if max(map(len, names), default=0) > _LONGEST_NAME else ""
     return [name.removeprefix(shared) for name in names] if all(n.startswith(shared) for n in names) else list(names)
@@ -113,7 +116,7 @@ def displacement(lengths: ArrayLike, moved: ArrayLike, *, name: str = "displacem
     """Draw the displacement of each Gaussian component.
 
     Args:
-        lengths: lengths of the displacements, in the order of time, shape (n_components,) [m].
+        lengths: length of each component's displacement, in the order of time, shape (n_components,) [m].
         moved: whether each component was moved, shape (n_components,).
         name: name of the figure, unique in the page.
 
@@ -156,14 +159,14 @@ def selection(
     *,
     name: str = "selection",
 ) -> str:
-    """Draw the information criteria and the error on held-out demonstrations for each number of components.
+    """Draw three criteria for the number of components: BIC, AIC and the error on held-out demonstrations.
 
     Args:
         n_components: the numbers of components that were compared, shape (n,).
         bic: Bayesian information criterion for each number of components, lower is better, shape (n,); may be empty.
         aic: Akaike information criterion for each number of components, lower is better, shape (n,); may be empty.
         held_out_error: root mean square distance to held-out demonstrations, shape (n,) [m]; may be empty.
-        chosen: number of components that was chosen.
+        chosen: the chosen number of components, which is marked.
         name: name of the figure, unique in the page.
 
     Returns:
@@ -198,7 +201,7 @@ def selection(
 
 @dataclass(frozen=True, eq=False)
 class JointCurve:
-    """A chart of one joint: a quantity over time, with the limits of the joint.
+    """The data of a small chart: a quantity of one joint over time, with its limits.
 
     Attributes:
         title: title above the chart.
@@ -223,7 +226,7 @@ def small_multiples(name: str, description: str, unit: str, times: Array, curves
         description: description for screen readers.
         unit: label of the vertical axis.
         times: time stamps, shape (n_steps,) [s].
-        curves: curves to draw, one for each joint.
+        curves: data to draw, one entry for each joint.
 
     Returns:
         An SVG element.

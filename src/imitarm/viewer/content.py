@@ -1,4 +1,4 @@
-"""The content of a report: results of runs, numbers derived from the results, and all numbers as plain data.
+"""The content of a report: the results of runs, and numbers that are computed from these results.
 
 :mod:`~imitarm.viewer.report` draws a page from this content.
 """
@@ -20,7 +20,7 @@ from imitarm.trajectory import Demonstration, Rollout, Trajectory
 from imitarm.viewer.recording import Recording
 
 CERTIFICATE_VOID = (
-    "an obstacle moves, so the certificate holds only while the motion is on schedule, but the motion did not finish"
+    "an obstacle moves, so the certificate requires that the motion stays on schedule; the motion did not finish"
 )
 
 Array = NDArray[np.float64]
@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 @runtime_checkable
 class AdaptedPath(Protocol):
-    """The attributes that an adapted path needs to be drawn; :class:`imitarm.policies.Adaptation` has them."""
+    """An adapted path with all attributes that the report draws, such as :class:`imitarm.policies.Adaptation`."""
 
     @property
     def nominal(self) -> Trajectory:
@@ -64,7 +64,7 @@ class AdaptedPath(Protocol):
 
     @property
     def only_on_schedule(self) -> bool:
-        """Whether the certified clearance holds only while the motion is on schedule, because an obstacle moves."""
+        """Whether an obstacle moves, so that the certified clearance holds only while the motion is on schedule."""
 
     @property
     def feasible(self) -> bool:
@@ -84,7 +84,7 @@ class SceneResult:
     """The results in one scene: the planned path and the measured motion of the robot.
 
     Attributes:
-        name: short name, unique in the report; used in links.
+        name: short name for links, unique in the report.
         title: title as shown to the reader.
         scene: goal and obstacles.
         success: whether the task succeeded.
@@ -95,11 +95,11 @@ class SceneResult:
         rmse: root mean square distance from the measured path to the demonstrations [m]; NaN when unknown.
         reason: explanation of why the run ended.
         tool_radius: radius of the sphere that contained the tool in the plan [m].
-        tool_spheres: spheres that contained the tool in the plan, used instead of ``tool_radius``: rows of x, y, z,
-            radius in the tool frame, shape (m, 4) [m].
+        tool_spheres: spheres that contained the tool in the plan, as rows of x, y, z and radius in the tool frame,
+            shape (m, 4) [m]. None: one sphere with ``tool_radius``.
         recording: recorded poses of all bodies, for the 3-D playback.
         torque_limits: rated torques, shape (n_joints,) [N m].
-        joint_names: titles of the torque charts.
+        joint_names: joint names, used as titles of the torque charts.
         caption: one sentence that describes the scene.
         details: further measured values of the task; each name becomes a column of the table of results.
 
@@ -165,7 +165,7 @@ class SceneResult:
 
 
 class Candidate(Protocol):
-    """Scores of one number of components; :class:`imitarm.skills.mixture_fitting.Candidate` has these attributes."""
+    """Criteria of one number of components, as in :class:`imitarm.skills.mixture_fitting.Candidate`."""
 
     @property
     def n_components(self) -> int:
@@ -181,7 +181,7 @@ class Candidate(Protocol):
 
     @property
     def held_out_rmse_mm(self) -> float:
-        """Error on demonstrations that were not used for learning [mm]; NaN when all had to be used."""
+        """Error on demonstrations that were held out of learning [mm]; NaN if no demonstration was held out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +193,7 @@ class LearningSummary:
         means: means of the Gaussian components' positions, shape (n_components, 3) [m].
         covariances: covariances of the Gaussian components' positions, shape (n_components, 3, 3) [m^2].
         predicted: the learned path.
-        candidates: evaluations of the numbers of components that were compared.
+        candidates: criteria of the numbers of components that were compared.
         findings: findings of ``lint`` about the recordings.
         alignment: result of ``align``; None when the demonstrations were not aligned.
         details: further facts about learning, by name.
@@ -271,7 +271,7 @@ class Report:
 
 
 def as_data(report: Report) -> dict[str, Any]:
-    """Return the report's numbers as plain values in SI units, ready for JSON; unknown numbers become None."""
+    """Return the report's numbers in SI units as Python objects for JSON; unknown numbers become None."""
     scenes = []
     for scene in report.scenes:
         adaptation = scene.adaptation

@@ -1,4 +1,4 @@
-"""Convert MuJoCo's geoms to triangle meshes that have few triangles but show sharp edges and smooth round surfaces.
+"""Convert MuJoCo's geoms to triangle meshes with few triangles, sharp edges and smooth round surfaces.
 
 Renderers average the normals of triangles that share a vertex, so shared vertices look smooth. Faces that meet at a
 sharp edge therefore get separate vertices, while the faces of a round surface share vertices.
@@ -42,14 +42,14 @@ class Mesh:
 
 
 def merge(meshes: list[Mesh]) -> Mesh:
-    """Return one mesh with the triangles of all ``meshes``."""
+    """Combine several meshes into one mesh."""
     starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]
     return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
 
 
 def box(half_size: ArrayLike) -> Mesh:
-    """Return a box with edges of length ``2 * half_size`` (3,) [m]: six faces with four vertices each."""
+    """Return a box with edges of length ``2 * half_size`` (3,) [m]; every face has four vertices of its own."""
     corners: list[Array] = []
     faces: list[tuple[int, int, int]] = []
     for axis in range(3):

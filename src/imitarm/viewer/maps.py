@@ -32,7 +32,7 @@ class View:
 
     Attributes:
         across: coordinate on the horizontal axis of the figure: 0, 1, 2 for x, y, z.
-        up: coordinate on the vertical axis of the figure.
+        up: coordinate on the vertical axis of the figure: 0, 1, 2 for x, y, z.
     """
 
     across: int = 0
@@ -50,12 +50,12 @@ class View:
 
     @property
     def leftwards(self) -> bool:
-        """Whether the horizontal coordinate increases to the left; so does y if x points up."""
+        """Whether the horizontal coordinate increases to the left, as y does in a view from above with x upwards."""
         return (self.across, self.up) == (1, 0)
 
     @classmethod
     def best(cls, positions: ArrayLike) -> View:
-        """Return the view in which ``positions`` (n, 3) [m] extend furthest, or nearly so; from above if possible."""
+        """Return the view that shows ``positions`` (n, 3) [m] largest; if nearly as large, the view from above."""
         spans = np.ptp(np.asarray(positions, dtype=float), axis=0)
         if spans[2] <= 1.25 * spans[:2].min():
             return cls(0, 1) if spans[0] >= spans[1] else cls(1, 0)
@@ -70,7 +70,7 @@ class View:
 def drawn_map(
     name: str, text: str, view: View, corners: Array, *, legend_rows: int, note: str = "", stretched: bool = False
 ) -> Iterator[tuple[Any, Canvas]]:
-    """Yield axes that show the area between ``corners`` (2, 2) [m]; afterwards, convert the figure to SVG.
+    """Yield axes that show the area between ``corners``. After the drawing, convert the figure to SVG.
 
     Args:
         name: name of the figure, unique in the page.
@@ -127,10 +127,11 @@ class Grid:
         return cls(view, *(np.arange(low[i], high[i] + step, step) for i in range(2)))
 
     def distance_to(self, obstacle: Obstacle, depths: Array) -> Array:
-        """Return each grid point's distance to an obstacle, at the nearest of the depths, shape (rows, columns) [m].
+        """Return each grid point's smallest distance to an obstacle over all ``depths``, shape (rows, columns) [m].
 
-        ``depths`` are coordinates along the line of sight. The grid points with distance 0 form an outline: with
-        one depth, the outline of the obstacle's cross-section; with many depths, the outline of its projection.
+        ``depths`` are coordinates along the line of sight. The line on which the distance is 0 is an outline. With one
+        depth, it is the outline of the obstacle's cross-section. With many depths, it is the outline of the obstacle's
+        projection.
         """
         points = np.empty((len(depths), len(self.up), len(self.across), 3))
         points[..., self.view.across] = self.across
@@ -220,7 +221,7 @@ def _draw_swept(axes: Any, grid: Grid, centres: Array, radii: Array) -> None:
 
 
 def draw_obstacles(axes: Any, scene: Scene, grid: Grid, depth: Array, clearance: float, path: Array) -> None:
-    """Fill the obstacles, and draw dashed lines around them that the tool must not cross."""
+    """Fill the obstacles, and draw a dashed line at the required clearance around each of them."""
     depths = np.linspace(depth.min(), depth.max(), 9) if np.ptp(depth) > 2e-3 else np.array([depth.mean()])
     for obstacle in scene.obstacles:
         distance = grid.distance_to(obstacle, depths)

@@ -1,8 +1,8 @@
-"""A self-contained HTML page: the data that its templates show, its 3-D players, and the function that writes it.
+"""Self-contained HTML pages: the data that the templates show, the 3-D players, and writing the file.
 
-The templates are in ``templates/``; Jinja escapes every text that they show. The content security policy of the page
-forbids every network request, so the browser itself ensures that the page works offline. Each 3-D player is an iframe
-that is created when the reader scrolls to it. The code that all players share is stored once.
+The templates are in ``templates/``. Jinja escapes every text in a page. The content security policy of the page forbids
+every network request, so the browser itself ensures that the page works offline. Each 3-D player is an iframe that is
+created when the reader scrolls to it. The code that all players share is stored once.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MM: Final = 1000.0  # [mm/m], and [ms/s]
 
 @dataclass(frozen=True)
 class Tile:
-    """A number in the header of a page: ``value`` as text, ``unit``, and ``label``, the meaning of the number."""
+    """A number in the header of a page: its ``value`` as text, its ``unit``, and its meaning (``label``)."""
 
     value: str
     unit: str
@@ -54,7 +54,7 @@ class Header:
 
 @dataclass(frozen=True)
 class Figure:
-    """A drawing (``svg``) with ``title`` and ``caption``; a drawing with an empty ``svg`` is left out of the page."""
+    """A drawing (``svg``) with ``title`` and ``caption``. If ``svg`` is empty, the page does not show the figure."""
 
     svg: str
     title: str
@@ -76,7 +76,7 @@ class Player:
 
     Attributes:
         title: title for screen readers.
-        own: the middle part of this player's 3-D page, which differs between players; see :func:`shared_players`.
+        own: the part of the 3-D page that differs from the other players' pages; see :func:`shared_players`.
         keys: entries of the player's legend.
     """
 
@@ -113,9 +113,9 @@ def render(
         data: the numbers on the page in SI units, ready for JSON; a button on the page saves them.
         data_name: file name under which the browser saves ``data``.
         provenance: facts that are needed to repeat the run, by name; a value that is a mapping becomes a separate card.
-        words: explanations of the technical terms on the page.
-        shared: beginning and end of every 3-D player, see :func:`shared_players`; None without players.
-        context: further data for the template.
+        words: technical terms on the page, with their explanations.
+        shared: the code that all 3-D players share, see :func:`shared_players`; None without players.
+        context: further variables of the template.
 
     Raises:
         InputError: when jinja2 is not installed.
@@ -167,17 +167,17 @@ def number(value: float, digits: int = 1, unit: str = "") -> str:
 
 
 def script_text(value: Any) -> str:
-    """Return ``value`` as JSON that is safe in a script element: it can't close the element or open a comment."""
+    """Return ``value`` as JSON for a script element; no text in it can close the element or open a comment."""
     return json.dumps(value, ensure_ascii=False).replace("<", "\\u003c").replace(">", "\\u003e")
 
 
 def anchor(kind: str, index: int, name: str) -> str:
-    """Return an anchor for links: a number, which makes the anchor unique, and a readable name."""
+    """Return an anchor for links, made unique by a number and readable by a name."""
     return f"{kind}-{index + 1}-" + (re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-") or "x")
 
 
 def shared_players(pages: Mapping[str, str]) -> tuple[tuple[str, str] | None, dict[str, str]]:
-    """Split 3-D pages into a beginning and an end that all pages share, and an individual middle part.
+    """Split 3-D pages into a beginning and an end that all pages share, and a middle part for each page.
 
     Most of each 3-D page is the code of the player. Storing this code only once makes a report with five players five
     times smaller.
@@ -211,7 +211,7 @@ def _common_start(texts: list[str]) -> str:
 
 
 def check_writable(path: str | Path) -> Path:
-    """Check that a page can be written to a path; call this before the page is drawn.
+    """Check that a page can be written to a path, before time is spent on drawing the page.
 
     Returns:
         The absolute path.
@@ -232,8 +232,7 @@ def check_writable(path: str | Path) -> Path:
 def draw_page(draw: Callable[[], str], path: str | Path) -> Path:
     """Write a page as one HTML file that needs no other file.
 
-    The path is checked before anything is drawn. The page is written to a temporary file, which is renamed at the end.
-    Therefore an older page stays intact when writing fails.
+    The path is checked before anything is drawn. If writing fails, an older page at this path stays intact.
 
     Args:
         draw: function that returns the page.

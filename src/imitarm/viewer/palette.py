@@ -1,7 +1,7 @@
 """Colours; each colour has the same meaning in the 3-D view, the figures and the page.
 
-All colours are greys or from the Okabe-Ito palette, which colour-blind readers can distinguish. Line styles repeat the
-meanings of the colours, so that every figure can be read without colour.
+All colours are greys or from the Okabe-Ito palette, which colour-blind readers can distinguish. In every figure, lines
+of different colours also have different styles, so the figure can be read without colour.
 """
 
 from __future__ import annotations

@@ -55,9 +55,9 @@ class PersonMark:
         name: name, unique in the 3-D scene.
         positions: positions of the joints :data:`imitarm.capture.skeleton.JOINTS` in the world frame, shape (n_frames,
             25, 3) [m]; NaN where lost.
-        tracking: :class:`~imitarm.capture.skeleton.Tracking` of each joint, shape (n_frames, 25); inferred joints are
-            drawn paler, lost joints are not drawn.
-        side: side of the arm that is drawn in the colour of a demonstration.
+        tracking: :class:`~imitarm.capture.skeleton.Tracking` of each joint, shape (n_frames, 25). Inferred joints are
+            drawn in a paler colour; lost joints are not drawn.
+        side: which arm is drawn in the colour of a demonstration, ``"left"`` or ``"right"``.
 
     Raises:
         InputError: when a shape is wrong.
@@ -91,14 +91,14 @@ class PersonMark:
         floor: float = 0.0,
         name: str = "person",
     ) -> PersonMark:
-        """Place a recorded person beside a robot, rotated so that person and robot move in the same directions.
+        """Place a recorded person beside a robot. The person is rotated such that both move in the same directions.
 
         Args:
-            skeletons: at least one skeleton, in the order of their times. In a gap of more than 0.25 s between
-                skeletons, the person disappears after 0.25 s. After the last skeleton, the person stands still.
+            skeletons: at least one skeleton, in the order of their times. If no skeleton follows within 0.25 s, the
+                person disappears until the next skeleton. After the last skeleton, the person stands still.
             times: times of the frames to draw, counted from the first skeleton, shape (n_frames,) [s].
             sensor_to_base: pose of the sensor in the base frame; only its rotation is used.
-            side: side of the arm that is followed.
+            side: which arm the robot follows, ``"left"`` or ``"right"``.
             place: median position of the hips in the base frame: x and y [m].
             floor: height of the floor in the base frame [m].
             name: name of the person.
@@ -167,11 +167,11 @@ class _Piece:
 
 
 def draw_person(server: Any, person: PersonMark) -> list[Mover]:
-    """Draw a person in the pose of the first frame, and return all pieces that move, appear or disappear.
+    """Draw a person in the pose of the first frame, and return the pieces of the drawing that change later.
 
-    Every bone is rigid, with its median length over all frames. The pieces are not sent to viser as one batch. A batch
-    would need fewer messages, but the browser builds a batch asynchronously. After a jump in time, a batch could
-    therefore show the person and the robot in different frames.
+    Every bone is rigid and has its median length over all frames. The pieces are separate nodes of viser's scene, not
+    one batch. The browser builds a batch asynchronously, so a batch could show the person and the robot in different
+    frames after a jump in time.
     """
     movers = []
     for piece in _pieces(person):

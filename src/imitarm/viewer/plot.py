@@ -27,7 +27,7 @@ _DEPTHS: Final = 25  # cross-sections of an obstacle that make its projection
 
 
 def plot(thing: Any) -> Any:
-    """Draw one object, and return the matplotlib figure.
+    """Draw an object of this library, and return the matplotlib figure.
 
     Args:
         thing: object to draw:
@@ -39,7 +39,7 @@ def plot(thing: Any) -> Any:
               and z over time with a band of two standard deviations;
             * an :class:`~imitarm.Adaptation`: the learned path, the adapted path and the moved components, and x, y
               and z of both paths over time;
-            * a :class:`~imitarm.Rollout`: the measured path; clearance, joint velocities and torques over time;
+            * a :class:`~imitarm.Rollout`: the measured path, and clearance, joint velocities and torques over time;
             * a :class:`~imitarm.Scene`: the goal and the obstacles, from above and from the side.
 
     Returns:

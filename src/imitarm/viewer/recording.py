@@ -1,6 +1,6 @@
 """Recording of a simulation for the 3-D playback: the poses of all bodies, and the predictions of a tracker.
 
-:class:`FrameRecorder` records both at a fixed rate while the simulation runs.
+:class:`FrameRecorder` records poses and predictions at a fixed rate while the simulation runs.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from imitarm.scene import Scene
 Array = NDArray[np.float64]
 
 AHEAD = 0.3
-"""Time between an observation and the instant for which the drawn prediction is made [s]."""
+"""Time from an observation to the instant for which the playback shows the obstacle's predicted position [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """The positions that a tracker predicted for one obstacle, :data:`AHEAD` seconds ahead, for each frame.
+    """Positions of one obstacle that a tracker predicted, in each frame for :data:`AHEAD` seconds later.
 
     Attributes:
-        name: name of the obstacle in the observed scenes.
+        name: name of the obstacle in the scenes that the tracker returned.
         positions: predicted positions of the obstacle's local frame, shape (n_frames, 3) [m]; nan in frames without the
             obstacle.
         covariances: covariances of these positions, shape (n_frames, 3, 3) [m^2].
@@ -47,7 +47,7 @@ class Recording:
         times: times of the frames, strictly increasing, shape (n_frames,) [s].
         positions: body positions in the world frame, shape (n_frames, n_bodies, 3) [m].
         quaternions: body rotations wxyz in the world frame, shape (n_frames, n_bodies, 4).
-        predictions: predictions of the tracked obstacles, each with n_frames positions.
+        predictions: predicted positions of the tracked obstacles, one :class:`Prediction` for each obstacle.
 
     Raises:
         InputError: when shapes disagree, a number is not finite or the times do not increase.
@@ -70,7 +70,8 @@ class Recording:
         for prediction in self.predictions:
             if len(prediction.positions) != n:
                 raise InputError(
-                    f"Recording predictions: {prediction.name} has {len(prediction.positions)} positions for {n} frames"
+                    f"Recording predictions: {prediction.name} has {len(prediction.positions)} positions, but needs "
+                    f"{n}, one for each frame"
                 )
         if n < 1 or np.any(np.diff(self.times) <= 0.0):
             raise InputError(
@@ -112,7 +113,7 @@ class FrameRecorder:
         Args:
             data: the state of the simulation, in which the body poses are up to date.
             time: simulated time [s]; None: ``data.time``.
-            scene: the observed scene; its tracked obstacles are drawn at their predicted positions.
+            scene: the scene that a tracker returned; the playback shows the predicted positions of its obstacles.
         """
         now = float(data.time if time is None else time)
         if not self._frames or now >= self._frames[-1][0] + self._period - 1e-9:

@@ -1,4 +1,4 @@
-"""The report of a run as one HTML page: every scene with 3-D playback and figures, and the learned skill.
+"""The report of a run as one HTML page: a 3-D playback and figures for each scene, and the learned skill.
 
 The page is drawn from ``templates/report.html``; :mod:`~imitarm.viewer.content` defines its content.
 """
@@ -43,18 +43,19 @@ _WORDS: Final = {
     "Demonstration": "One recording of a motion demonstrated by a person, here by guiding the arm's tool by hand.",
     "Learned path": "The mean of all demonstrations. The robot follows the learned path if no obstacle is in the way.",
     "Gaussian component": "The learned motion consists of Gaussian components, which follow one another along the "
-    "path. Each component is drawn as an ellipse that contains 95 % of the demonstrated positions in its part of the "
+    "path. Each component is drawn as an ellipse that contains 95 % of the demonstrated positions in this part of the "
     "motion. Where the ellipse is small, all demonstrations agree, and the task needs precision.",
-    "Adaptation (ACFRA)": "Only the components near an obstacle are moved. Everywhere else the robot follows the "
-    "learned path.",
-    "Tolerance": "How far a path may be from the learned path and still resemble the demonstrations: two standard "
-    "deviations of the demonstrations to each side.",
+    "Adaptation (ACFRA)": "The method ACFRA moves only the components near an obstacle. Everywhere else the robot "
+    "follows the learned path.",
+    "Tolerance": "The distance from the learned path within which most demonstrations lie: two standard deviations of "
+    "the demonstrations to each side. A path within the tolerance resembles the demonstrations.",
     "Clearance": "The smallest distance between any part of the arm or its tool and any obstacle. The simulator "
     "measures this distance between the exact shapes while the arm moves; the value is not taken from the plan.",
     "Certified clearance": "A guaranteed lower bound of the distance to any obstacle on the whole planned path. If "
-    "only the path of the tool was planned, the bound holds for the tool; otherwise for every moving part of the arm.",
-    "RMSE": "Root mean square error: the typical distance between the measured path and the demonstrations. The "
-    "error is larger where the path has to go around an obstacle.",
+    "only the path of the tool was planned, the bound holds only for the tool. If the motion of the whole arm was "
+    "planned, the bound holds for every moving part of the arm.",
+    "RMSE": "Root mean square distance between the measured path and the demonstrations. The distance is larger where "
+    "the path has to go around an obstacle.",
     "Rated torque": "The torque that the drive of a joint can deliver continuously. A real arm can execute a motion "
     "whose torques stay below their rated values.",
 }
@@ -227,8 +228,8 @@ def _scene_figures(key: str, scene: SceneResult) -> Iterator[Figure]:
             yield Figure(
                 svg,
                 "Path around the obstacles",
-                "Path of the tool centre point. The dotted line bounds the area that the tool sweeps. "
-                "The swept area must stay outside the dashed lines. Arrows show how far components were moved.",
+                "Path of the tool centre point. The tool sweeps the area inside the dotted line. "
+                "This area must stay outside the dashed lines. Arrows show how far components were moved.",
             )
             lengths = np.linalg.norm(adaptation.displacement, axis=1)
             svg = charts.displacement(lengths, adaptation.moved, name=f"{key}-moved")
@@ -304,7 +305,7 @@ def _learning_figures(learning: LearningSummary) -> Iterator[Figure]:
     yield Figure(
         maps.demonstrations(learning.demonstrations, learning.means, learning.covariances, learning.predicted),
         f"{len(learning.demonstrations)} demonstrations, {learning.n_components} components",
-        "Where the demonstrations agree, the ellipses are small: the task needs precision there.",
+        "Where the demonstrations agree, the ellipses are small, and the task needs precision.",
     )
     if learning.candidates:
         tried = learning.candidates
@@ -317,7 +318,7 @@ def _learning_figures(learning: LearningSummary) -> Iterator[Figure]:
         )
         caption = (
             "More components always fit the recordings more closely. Therefore the number is chosen by the error on "
-            "demonstrations that were held out of learning. The criteria BIC and AIC balance the fit against the "
-            "number of parameters."
+            "demonstrations that were held out of learning. The criteria BIC and AIC add a penalty for the number of "
+            "parameters; lower values are better."
         )
         yield Figure(svg, "Number of components", caption)

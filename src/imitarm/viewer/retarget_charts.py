@@ -1,4 +1,4 @@
-"""Charts of a retargeting over time: states, joints and their limits, the tool and its target, the upper arms.
+"""Charts of a retargeted motion over time: states, joints, the tool and its target, and the upper arms.
 
 Every public function that draws returns one ``<svg>`` element.
 """
@@ -20,12 +20,12 @@ from imitarm.viewer.charts import JointCurve, short_names, small_multiples
 Array = NDArray[np.float64]
 
 STATE_COLOURS: Final = dict(zip(EngagementState, ("#bfc5cf", "#009e73", "#56b4e9", "#e69f00", "#d55e00"), strict=True))
-"""Colours of the states of a retargeter, in the order of the legend."""
+"""Colours of the states of a retargeter (waiting, following, coasting, holding, stopped), in this order."""
 _DEGREES: Final = 180.0 / np.pi
 
 
 def states(runs: Sequence[tuple[str, Retargeting]], *, name: str = "states") -> str:
-    """Draw the engagement state of each method over time, as one coloured band for each method.
+    """Draw one coloured band for each method, which shows the state of the retargeter over time.
 
     Args:
         runs: title and retargeted motion of each method.
@@ -63,14 +63,14 @@ def states(runs: Sequence[tuple[str, Retargeting]], *, name: str = "states") -> 
 
 
 def stretches(states: NDArray[Any]) -> list[tuple[int, int]]:
-    """Return the first and the last index of each interval in which the state does not change."""
+    """Return the first and the last index of each interval with a constant state."""
     ends = np.flatnonzero(states[1:] != states[:-1])
     firsts = np.concatenate([[0], ends + 1])
     return list(zip(firsts.tolist(), [*ends.tolist(), len(states) - 1], strict=True))
 
 
 def tool(run: Retargeting, path: Array, *, name: str = "tool") -> str:
-    """Draw the tool and its target over time, one chart for each axis, and the distance between them.
+    """Draw tool and target over time, in one chart for each axis, and the distance between tool and target.
 
     Args:
         run: the retargeted motion.
@@ -157,11 +157,11 @@ def _percentages(run: Retargeting, times: Array, percentages: Array, what: str, 
 
 
 def elbow(run: Retargeting, points: Array, *, name: str = "elbow") -> str:
-    """Draw two angles of the upper arms of person and robot: how far they point upwards, and how far to the left.
+    """Draw how far the upper arms of person and robot point upwards and to the left, as angles over time.
 
     Args:
         run: the retargeted motion.
-        points: the robot's shoulder, elbow and wrist, shape (n, 3, 3) [m].
+        points: positions of the robot's shoulder, elbow and wrist at each sample, shape (n, 3, 3) [m].
         name: name of the figure, unique in the page.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The report on the retargeting of one recording: an HTML page with person and robot side by side, figures, measures.
+"""The report on a retargeted recording: an HTML page with person and robot side by side, figures and measures.
 
 The page is drawn from ``templates/retarget.html``.
 """
@@ -32,7 +32,7 @@ PLAYER_KEYS: Final = (
     Key(palette.DEMONSTRATION, "the person's arm and the target of the tool"),
     Key(palette.ADAPTED, "path of the robot's tool"),
 )
-"""The legend of a 3-D player with a person beside a robot."""
+"""Legend of the 3-D player that shows a person beside a robot."""
 
 _PERSON_PLACE: Final = (0.0, 1.35)  # [m] of the person in the base frame, to the left of the robot
 _VIEW: Final = (1.0, -0.42, 0.36)  # direction towards the camera: person and robot are seen from the front
@@ -41,28 +41,25 @@ _FINGER_TIME: Final = 0.25  # [s] for the fingers to open or close
 _WORDS: Final = {
     "Retargeting": "The motion of a person's arm, measured by a camera, is converted to a motion of a robot arm. "
     "The robot's tool follows the hand. If the method supports it, the robot's elbow follows the person's elbow.",
-    "Target": "The position that the method wants the tool to reach. The target is the tool's position at the time "
-    "when the robot began to follow the person, plus the displacement of the hand since that time, multiplied "
-    "by the scale.",
+    "Target": "The desired position of the tool. The target starts at the tool's position when the robot begins to "
+    "follow the person. The target then moves by the displacement of the hand, multiplied by the scale.",
     "Following, coasting, holding, stopped": "Following: the camera sees the person's arm, and the tool follows the "
-    "hand. Coasting: the arm has been lost "
-    "for up to 0.1 s, and the motion continues with decaying velocity. Holding: the arm has been lost for up to 0.3 "
-    "s, and the target stands still. Stopped: the arm has been lost for longer than 0.3 s; following resumes after "
-    "the arm has been seen for 0.5 s.",
+    "hand. Coasting: the camera lost the arm up to 0.1 s ago, and the motion continues with decaying velocity. "
+    "Holding: the camera lost the arm 0.1 to 0.3 s ago, and the target stands still. Stopped: the camera lost the arm "
+    "more than 0.3 s ago. The robot follows again after the camera has seen the arm for 0.5 s.",
     "Frames beyond a limit": "Control periods in which a joint exceeds a limit of position, velocity or "
-    "acceleration. The numbers are computed from the commanded joint positions, which the drives of a real arm would "
-    "have to execute.",
-    "Smallest singular value": "The smallest ratio of tool speed to joint speed, over all directions of motion. If the "
-    "value is near 0, the arm is almost stretched or folded, and small motions of the tool need fast motions of the "
-    "joints.",
-    "Torque": "The torque that the motion needs, computed by inverse dynamics without friction. The weight "
-    "part of the torque holds the arm against gravity.",
+    "acceleration. The velocities and accelerations are computed from the commanded joint positions.",
+    "Smallest singular value": "The smallest ratio of tool speed to joint speed, over all directions of motion. A "
+    "value near 0 means that the arm is almost stretched or folded. In some direction, even a slow motion of the tool "
+    "then needs fast joints.",
+    "Torque": "The torque that the motion needs, computed by inverse dynamics without friction. A part of the torque "
+    "holds the weight of the arm.",
 }
 
 
 @dataclass(frozen=True)
 class Measure:
-    """One measured value of a retargeting, for a table.
+    """One value of the table that compares the methods.
 
     Attributes:
         label: label of the value in the table.
@@ -70,7 +67,7 @@ class Measure:
         unit: unit of the value in the table.
         digits: number of decimals.
         better: ``"less"`` or ``"more"``, whichever is better; ``""`` if neither is.
-        fault: whether any value above 0 is a fault, which is marked in red.
+        fault: whether a value above 0 is a fault; faults are marked in red.
     """
 
     label: str
@@ -99,7 +96,7 @@ class MethodResult:
         name: short name, unique in the report.
         title: title of the tab.
         run: the retargeted motion.
-        measures: measures of the run; all methods must have the same measures in the same order.
+        measures: values for the table of measures; all methods must have the same measures in the same order.
         tables: further tables for the tab of this method.
         notes: remarks about this run for the reader, one sentence each.
         caption: one sentence that describes the method.
@@ -123,7 +120,7 @@ class RetargetReport:
 
     Attributes:
         title: title of the page.
-        methods: results of at least one method; the header describes the first result.
+        methods: results of one or more methods; the header of the page describes the first one.
         skeletons: skeletons of the person, as the methods received them.
         correspondence: settings of the mapping from the person's motion to the robot's motion.
         verdict: the result in one line.
@@ -131,7 +128,7 @@ class RetargetReport:
         tiles: the most important measures.
         scene: obstacles around the robot.
         summary: one or two sentences that introduce the page.
-        findings: faults of the recording and changes made to it, one sentence each.
+        findings: faults that were found in the recording, and corrections of the recording, one sentence each.
         provenance: facts needed to repeat the run, by name.
 
     Raises:
@@ -212,14 +209,14 @@ def retarget_report_html(report: RetargetReport) -> str:
         states=Figure(
             retarget_charts.states([(method.name, method.run) for method in report.methods]),
             "States over time",
-            "The table of measures states the fraction of the time in each state.",
+            "The table of measures contains the fraction of the time that each method spent in each state.",
         ),
         findings=report.findings,
     )
 
 
 def playback(report: RetargetReport, method: MethodResult, *, dark: bool = False) -> str:
-    """Return a 3-D page in which the person and the robot move side by side and at the same time.
+    """Return a 3-D page that plays the motions of person and robot side by side.
 
     Args:
         report: report with the person and the scene.
@@ -297,8 +294,8 @@ def _figures(run: Retargeting, key: str) -> Iterator[Figure]:
     yield Figure(
         retarget_charts.tool(run, path, name=f"{key}-tool"),
         "Tool and target",
-        "The target exists from the time at which the robot begins to follow the person. The lag of the method and "
-        "the limits of the arm cause the distance between tool and target.",
+        "The target is shown while the robot follows the person. The lag of the method and the limits of the arm cause "
+        "the distance between tool and target.",
     )
     yield Figure(
         retarget_charts.velocities(run, name=f"{key}-velocities"),
@@ -322,8 +319,8 @@ def _figures(run: Retargeting, key: str) -> Iterator[Figure]:
         yield Figure(
             retarget_charts.elbow(run, points, name=f"{key}-elbow"),
             "Direction of the upper arm",
-            "Robot and person start in different postures, so compare how the two directions change, not their "
-            "values. An upward angle of 90° means straight up; a leftward angle of 90° means straight left.",
+            "Robot and person start in different postures. Therefore, compare the changes of the two directions, not "
+            "their values. An upward angle of 90° means straight up; a leftward angle of 90° means straight left.",
         )
 
 

@@ -1,8 +1,8 @@
 """Interactive 3-D playback in a browser, as one HTML page that needs no network.
 
-:func:`playback_html` draws the model of a :class:`~imitarm.viewer.recording.Recording` with paths and Gaussian
-components around it, and moves the bodies as they were recorded. The package viser draws the page in the reader's
-browser. Viser needs a server on this machine only while the page is written.
+:func:`playback_html` draws the bodies of a :class:`~imitarm.viewer.recording.Recording`, paths and Gaussian components,
+and moves the bodies as recorded. The package viser draws in the reader's browser. Viser needs a server on this machine
+only while the page is written.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _BACKDROP: Final = {False: ((246, 247, 249), (221, 225, 231)), True: ((38, 42, 5
 
 @dataclass(frozen=True, eq=False)
 class PathMark:
-    """A path to draw: ``positions`` (n, 3) [m] in the world frame, ``thickness`` of the line [m]."""
+    """A path to draw: ``positions`` (n, 3) [m] in the world frame, and the ``thickness`` of the line [m]."""
 
     name: str
     positions: Array
@@ -253,8 +253,8 @@ def playback_html(
     """Draw a recording and return one self-contained HTML page that plays it.
 
     Args:
-        recording: the model and the recorded poses of its bodies. Only geoms in groups 0 to 2 are drawn. Predicted
-            obstacles are drawn as translucent ellipsoids.
+        recording: the model and the recorded poses of its bodies. Only shapes (geoms) in groups 0 to 2 are drawn. The
+            predicted positions of obstacles are drawn as translucent ellipsoids.
         paths: lines to draw.
         components: Gaussian components to draw as translucent ellipsoids.
         persons: people to draw; each must have as many frames as the recording.
@@ -262,7 +262,7 @@ def playback_html(
         dark: whether controls and background are dark.
 
     Returns:
-        The text of the page, which can be saved, opened from disk without a network, or shown in an iframe.
+        The text of the page. The saved page opens without a network and can be shown in an iframe.
 
     Raises:
         InputError: when viser is not installed, or a person does not have as many frames as the recording.

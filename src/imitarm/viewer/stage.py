@@ -1,4 +1,4 @@
-"""Parts of every 3-D drawing: the meshes and the floor of a model, the camera, colours, and moving nodes."""
+"""Common parts of 3-D drawings: the meshes and the floor of a model, the camera, colours, and moving nodes."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class Camera:
 
     @classmethod
     def around(cls, points: ArrayLike, *, direction: ArrayLike = _VIEW, aspect: float = 16 / 9) -> Camera:
-        """Return the nearest camera in the direction ``direction`` that shows all ``points`` (n, 3) [m].
+        """Return the nearest camera that shows all ``points`` (n, 3) [m] from ``direction``.
 
         Args:
-            points: points in the world frame that must be visible.
+            points: points that must be visible, in the world frame, shape (n, 3) [m].
             direction: direction from the center of the points towards the camera.
             aspect: width of the picture divided by its height.
         """
@@ -92,7 +92,7 @@ def _vertices(recording: Recording, frame: int, bodies: Iterable[int], parts: Ma
 
 
 def points_to_see(recording: Recording, parts: Mapping[int, list[Part]], paths: Iterable[Array]) -> Array:
-    """Return points (n, 3) [m] that the camera should show: moving bodies, their parents, paths, nearby bodies."""
+    """Return points (n, 3) [m] for the camera to show: of moving bodies, their parents, paths and bodies nearby."""
     model, still = recording.model, recording.positions[:1]
     turned = np.any(np.abs(recording.quaternions - recording.quaternions[:1]) > 1e-3, axis=(0, 2))
     moves = np.any(np.abs(recording.positions - still) > 1e-3, axis=(0, 2)) | turned
@@ -113,7 +113,7 @@ def points_to_see(recording: Recording, parts: Mapping[int, list[Part]], paths: 
 
 
 def floor_height(recording: Recording, parts: Mapping[int, list[Part]]) -> float:
-    """Return the height of the floor [m]: the height of the lowest plane or vertex, but at most 0."""
+    """Return the height of the floor [m]: 0, or the height of the lowest plane or vertex if this is below 0."""
     model = recording.model
     planes = [model.geom_pos[g, 2] for g in range(model.ngeom) if model.geom_type[g] == mjtGeom.mjGEOM_PLANE]
     return float(min([*planes, *_vertices(recording, 0, parts, parts)[:, 2], 0.0]))
@@ -124,8 +124,8 @@ class Mover:
 
     Args:
         handle: handle of the node.
-        poses: values of the handle's attributes for all frames, such as ``position``, ``wxyz`` or ``visible``; the
-            first dimension is the frame.
+        poses: values of the node's attributes (such as ``position``, ``wxyz`` or ``visible``) by name. The first
+            dimension of each array is the frame.
     """
 
     def __init__(self, handle: Any, poses: Mapping[str, NDArray[Any]]) -> None:
@@ -136,7 +136,7 @@ class Mover:
         }
 
     def show(self, frame: int) -> None:
-        """Send the attributes of a frame that differ from the previous frame; nothing is sent for the first frame."""
+        """Send those attributes of the frame ``frame`` that differ from the previous frame."""
         for name, values in self._poses.items():
             if self._changed[name][frame - 1]:
                 value: Any = bool(values[frame]) if values.ndim == 1 else values[frame]
@@ -144,15 +144,15 @@ class Mover:
 
 
 def node_name(kind: str, *names: object) -> str:
-    """Return the name of a node; slashes in ``names`` are replaced, because viser reads them as tree levels."""
+    """Return the name of a node. Slashes in ``names`` are replaced, because viser reads them as tree levels."""
     return f"/{kind}/" + " ".join(str(name).replace("/", "|") for name in names)
 
 
 def lit(rgba: Sequence[float], *, linear: bool = False) -> tuple[float, float, float]:
     """Return the colour that looks like ``rgba`` under viser's lights, which are brighter than MuJoCo's lights.
 
-    Set ``linear`` for viser's batched meshes, whose colours must be linear RGB. The colours of single meshes must be
-    sRGB.
+    If ``linear`` is true, the result is linear RGB, which viser's batched meshes need. Otherwise, the result is sRGB,
+    which single meshes need.
     """
     srgb = np.asarray(rgba[:3], dtype=float)
     light = _EXPOSURE * np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
