@@ -333,6 +333,17 @@ def test_a_whole_arm_moves_among_the_same_obstacles():
     assert tables and all(table.title.startswith("sawyer: ") for table in tables)
 
 
+@pytest.mark.slow
+def test_a_camera_sees_the_obstacles_of_a_whole_arm():
+    result = MovingExperiment("M1", 3, 1000, "rcamo", world="sawyer", observer="camera").run()
+    assert result.outcome == "success" and result.value("clearance") > 0.0, result.reason
+    assert result.value("position_error") < 0.05 and result.value("unseen") > 0.0  # it comes from outside of the view
+    assert RESULTS.result(RESULTS.line(result)).experiment == result.experiment
+    both = MovingResults([result, replace(result, experiment=replace(result.experiment, observer="sensor"))])
+    assert both.settings == ["sawyer with a camera", "sawyer"] and len(both.in_setting("sawyer").all) == 1
+    assert any(table.title.startswith("sawyer with a camera: ") for table in moving_tables(both))
+
+
 def test_no_obstacle_passes_through_the_base_of_an_arm():
     arm = prepared("sawyer")[1]
     base, radii = arm.cover.base_centers, arm.cover.base_radii
@@ -370,6 +381,12 @@ def test_worlds_are_checked():
         MovingExperiment("M1", 3, 0, world="moon")
     with pytest.raises(InputError, match="needs dimension 3"):
         MovingExperiment("M1", 2, 0, world="sawyer")
+    with pytest.raises(UnknownNameError, match="observer"):
+        MovingExperiment("M1", 3, 0, world="sawyer", observer="ears")
+    with pytest.raises(InputError, match="needs one of the worlds"):
+        MovingExperiment("M1", 3, 0, observer="camera")
+    with pytest.raises(InputError, match="don't apply to a camera"):
+        MovingExperiment("M1", 3, 0, world="sawyer", observer="camera", noise=0.01)
     for method, world in (("aims-at-obstacle", "sawyer"), ("rcamo-certified", "tool"), ("rrt-connect", "tool")):
         with pytest.raises(UnknownNameError, match="method in the world"):
             MovingExperiment("M1", 3, 0, method, world=world)

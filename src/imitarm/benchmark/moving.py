@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from imitarm.benchmark.arm_oracle import ORACLES, ArmOracle
-from imitarm.benchmark.moving_arm import ROBOTS, arm_case, prepared, run_arm
+from imitarm.benchmark.moving_arm import OBSERVERS, ROBOTS, arm_case, prepared, run_arm
 from imitarm.benchmark.moving_controls import CONTROLS, control
 from imitarm.benchmark.moving_measures import OUTCOMES, SUCCESSES, measured
 from imitarm.benchmark.moving_scenes import FAMILIES, MovingCase, moving_case
@@ -91,6 +91,8 @@ class MovingExperiment:
         latency: delay of the sensor [s].
         dropout: probability that an obstacle is missed in a frame.
         occlusions: rate of occlusions [1/s].
+        observer: one of :data:`~imitarm.benchmark.moving_arm.OBSERVERS`. A camera needs a world with an arm; the five
+            numbers of the sensor must then have their default values, because the camera has its own noise and rate.
 
     Raises:
         UnknownNameError: when family or method is not known.
@@ -108,6 +110,7 @@ class MovingExperiment:
     latency: float = 0.033
     dropout: float = 0.0
     occlusions: float = 0.0
+    observer: str = OBSERVERS[0]
 
     def __post_init__(self) -> None:
         if self.family not in FAMILIES:
@@ -122,18 +125,29 @@ class MovingExperiment:
             raise InputError(f"MovingExperiment: the world {self.world!r} needs dimension 3, got {self.dimension}")
         if self.method not in method_names(self.world):
             raise UnknownNameError.among(f"method in the world {self.world!r}", self.method, method_names(self.world))
-        _ = self.sensor  # its checks
+        sensor = self.sensor  # its checks
+        if self.observer not in OBSERVERS:
+            raise UnknownNameError.among("observer", self.observer, OBSERVERS)
+        if self.observer == "camera" and self.world == "tool":
+            raise InputError(f"MovingExperiment: a camera needs one of the worlds {', '.join(ROBOTS)}, got 'tool'")
+        if self.observer == "camera" and sensor != SensorModel(latency=0.033, seed=self.seed):
+            raise InputError("MovingExperiment: noise, rate, latency, dropout and occlusions don't apply to a camera")
         object.__setattr__(self, "options", tuple(sorted((str(k), v) for k, v in self.options)))
 
     @property
     def sensor(self) -> SensorModel:
-        """The sensor."""
+        """The simulated sensor."""
         return SensorModel(self.noise, self.rate, self.latency, self.dropout, self.occlusions, seed=self.seed)
 
     @property
     def scene(self) -> tuple[str, int, int]:
         """The key of the scene; experiments of different methods in the same scene have the same key."""
         return self.family, self.dimension, self.seed
+
+    @property
+    def setting(self) -> str:
+        """The world, and the camera if there is one; results of one setting are compared with each other."""
+        return self.world if self.observer == OBSERVERS[0] else f"{self.world} with a {self.observer}"
 
     def case(self) -> MovingCase:
         """Return the scene."""
@@ -163,7 +177,7 @@ class MovingExperiment:
             else:
                 case = self.case()
                 policy = build(self.method, case, self.options, self.world)
-                found, reason, values = run_arm(policy, case, self.world, self.sensor)
+                found, reason, values = run_arm(policy, case, self.world, self.sensor, self.observer)
             values["n_obstacles"] = len(case.truth.scene.obstacles)
             values["touched"] = case.touched
         except (ImitarmError, ArithmeticError, ValueError, TypeError, LookupError, np.linalg.LinAlgError) as error:

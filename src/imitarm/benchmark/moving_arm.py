@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time as clock
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import lru_cache
 from typing import Any
@@ -26,14 +27,20 @@ from imitarm.perception import ObstacleTracker
 from imitarm.policies.policy import Observation, Policy
 from imitarm.robots import SimulatedRobot
 from imitarm.safety import SafetyFilter
+from imitarm.scene import Scene, standard_fixtures
 from imitarm.skills import Skill
 from imitarm.tasks.sweep import DEMONSTRATIONS
+from imitarm.tasks.watching import delayed, watched
 from imitarm.trajectory import Rollout
 
 Array = NDArray[np.float64]
 
 ROBOTS = {"sawyer": "brush", "panda": "gripper"}
 """Name of each arm, and the name of the tool that it holds."""
+OBSERVERS = ("sensor", "camera")
+"""How the obstacles are observed: by the simulated sensor, or by a depth camera that sees the arm and the obstacles."""
+_EYE, _MIDDLE = (1.9, -0.05, 1.1), (0.6, -0.05, 0.0)  # [m] the camera, and the point at which it looks
+_WORKSPACE = ((-0.3, -1.2, -0.7), (1.5, 1.1, 1.0))  # [m] in which the camera's detector searches for obstacles
 _SPARE = 0.01  # [m] beyond the required clearance, at the start and at the goal
 _INTERVAL = 0.05  # [s] between the instants at which the base is checked
 _STILL = 0.05  # [rad/s] joints slower than this stand
@@ -120,17 +127,33 @@ class _Timed(Policy):
         return self._policy.finished(observation)
 
 
-def run_arm(policy: Policy, case: MovingCase, robot: str, sensor: SensorModel) -> tuple[str, str, dict[str, Any]]:
+def run_arm(
+    policy: Policy, case: MovingCase, robot: str, sensor: SensorModel, observer: str = OBSERVERS[0]
+) -> tuple[str, str, dict[str, Any]]:
     """Let a policy move an arm in a scene; return the outcome, its explanation, and the measures.
 
     The measures are those of a tool without an arm, but the simulator measures clearance and contacts of the whole arm.
     The safety filter requires the clearance of all links.
+
+    Args:
+        policy: the policy.
+        case: the scene.
+        robot: name of the arm.
+        sensor: the simulated sensor; with a camera, only its seed is used.
+        observer: one of :data:`OBSERVERS`.
     """
     _, arm, start = prepared(robot)
-    body = SimulatedRobot(arm, scene=case.truth.scene, motion=case.truth.motions, q=start)
+    seen = delayed(case.truth) if observer == "camera" else case.truth
+    body = SimulatedRobot(arm, scene=seen.scene, motion=seen.motions, q=start)
     run, steps = ToolRun(), list[Step]()
     safety = SafetyFilter(arm, dt=DT, clearance=case.clearance)
-    observe = TrackedScene(case.truth, sensor, ObstacleTracker("imm"))
+    tracker = ObstacleTracker("imm")
+    observe: Callable[[float], Scene]
+    if observer == "camera":
+        fixtures = standard_fixtures()
+        observe = watched(body, _EYE, _MIDDLE, _WORKSPACE, surfaces=fixtures, tracker=tracker, seed=sensor.seed)
+    else:
+        observe = TrackedScene(case.truth, sensor, tracker)
     try:
         rollout = reproduce(
             _Timed(policy, run),

@@ -24,14 +24,14 @@ class MovingResults:
     def __init__(self, results: Sequence[MovingResult]) -> None:
         self.all = list(results)
 
-    def in_world(self, world: str) -> MovingResults:
-        """Return the results in one world."""
-        return MovingResults([r for r in self.all if r.experiment.world == world])
+    def in_setting(self, setting: str) -> MovingResults:
+        """Return the results of one setting, see :attr:`~imitarm.benchmark.moving.MovingExperiment.setting`."""
+        return MovingResults([r for r in self.all if r.experiment.setting == setting])
 
     @cached_property
-    def worlds(self) -> list[str]:
-        """The worlds in which there are results."""
-        return list(dict.fromkeys(r.experiment.world for r in self.all))
+    def settings(self) -> list[str]:
+        """The settings of which there are results."""
+        return list(dict.fromkeys(r.experiment.setting for r in self.all))
 
     @staticmethod
     def row_of(result: MovingResult) -> str:

@@ -36,13 +36,13 @@ _FORESEEN, _CAUSAL = ORACLES
 
 def moving_tables(results: MovingResults) -> list[Table]:
     """Return all tables: first the tables of the tool without an arm, then the tables of each arm."""
-    arms = [world for world in results.worlds if world != "tool"]
-    found = _tool_tables(results.in_world("tool")) if "tool" in results.worlds else []
-    for world in arms:
-        own = results.in_world(world)
+    arms = [setting for setting in results.settings if setting != "tool"]
+    found = _tool_tables(results.in_setting("tool")) if "tool" in results.settings else []
+    for setting in arms:
+        own = results.in_setting(setting)
         for table in (success_table(own), family_table(own), causes_table(own)):
-            note = f"The whole {world} in the simulator, with the safety filter. {_ARM_NOTE}" if table.note else ""
-            found.append(replace(table, title=f"{world}: {table.title}", note=note))
+            note = f"The whole {setting} in the simulator, with the safety filter. {_ARM_NOTE}" if table.note else ""
+            found.append(replace(table, title=f"{setting}: {table.title}", note=note))
     return [table for table in found if table.rows]
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from imitarm.benchmark.moving import WORLDS, MovingExperiment, default_methods, run_experiment
-from imitarm.benchmark.moving_arm import ROBOTS
+from imitarm.benchmark.moving_arm import OBSERVERS, ROBOTS
 from imitarm.benchmark.moving_results import RESULTS, MovingResults
 from imitarm.benchmark.moving_scenes import FAMILIES
 from imitarm.benchmark.moving_tables import family_table, moving_tables, success_table
@@ -42,6 +42,13 @@ def add_moving(parsers: Any) -> None:
         metavar="NAME",
         help="tool: the tool alone (the default); "
         + "; ".join(f"{robot}: the whole simulated arm with its {tool}" for robot, tool in ROBOTS.items()),
+    )
+    moving.add_argument(
+        "--observer",
+        choices=OBSERVERS,
+        default=OBSERVERS[0],
+        help="sensor: the positions of the obstacles, with noise (the default); "
+        "camera: a simulated depth camera, only with --world sawyer panda",
     )
     moving.add_argument("--dimensions", nargs="+", type=int, choices=(2, 3), default=[2, 3], help="default: 2 3")
     moving.add_argument(
@@ -110,7 +117,7 @@ def experiments_of(arguments: argparse.Namespace) -> list[MovingExperiment]:
     )
     seeds = range(arguments.first, arguments.first + arguments.count)
     return [
-        MovingExperiment(family, dimension, seed, method, (), world, *sensor)
+        MovingExperiment(family, dimension, seed, method, (), world, *sensor, arguments.observer)
         for seed in seeds
         for family in families
         for world in arguments.world
@@ -126,8 +133,8 @@ def _run(arguments: argparse.Namespace) -> int:
     store = RESULTS.store(arguments.out, reuse=arguments.reuse)
     done = run_with_progress("moving", wanted, run_experiment, store, workers, fresh=arguments.fresh)
     results = MovingResults(done.outcomes)
-    for world in results.worlds:
-        own = results.in_world(world)
+    for setting in results.settings:
+        own = results.in_setting(setting)
         report_tables([success_table(own), family_table(own)], None, [code_version()])
     say(done.summary)
     say(f"compare the methods: imitarm benchmark moving compare {arguments.out}")
@@ -139,7 +146,7 @@ def _compare(arguments: argparse.Namespace) -> int:
     check_outputs([("--report", arguments.report)], [("--fill", arguments.fill)], new_folders=True)
     found = RESULTS.read_folders(arguments.folders)
     results, versions = MovingResults(found), [r.code for r in found]
-    place = place_of(arguments, "moving" if "tool" in results.worlds else _WITH_ARM)
+    place = place_of(arguments, "moving" if "tool" in results.settings else _WITH_ARM)
     if set(versions) != {code_version()}:
         remark(origin(versions))
     report_tables(moving_tables(results), place, versions)

@@ -85,6 +85,7 @@ def watched(
     surfaces: Sequence[Obstacle],
     goal: Pose | None = None,
     fixtures: Sequence[Obstacle] = (),
+    tracker: ObstacleTracker | None = None,
     seed: int = 0,
 ) -> CameraObserver:
     """Observe the scene for one second with a depth camera, and return the function ``observe`` of a control loop.
@@ -101,12 +102,13 @@ def watched(
             be larger than in the simulated world.
         goal: goal that the observed scenes contain.
         fixtures: fixtures that the observed scenes contain.
+        tracker: tracker that follows the detected obstacles; None: a new one with the default options.
         seed: seed of the camera's noise.
     """
     observe = CameraObserver(
         camera_in_front(robot, eye, middle, seed=seed).frame,
         ObstacleDetector(robot.arm, surfaces=surfaces, workspace=workspace),
-        ObstacleTracker(),
+        ObstacleTracker() if tracker is None else tracker,
         joints=lambda: robot.state().q,
         clock=robot.time + WATCHES,
         goal=goal,
