@@ -53,8 +53,8 @@ class SafetyStep:
 
     Attributes:
         velocity: joint velocity to send, shape (n_joints,) [rad/s].
-        changed: norm of the change that the clearances caused, compared with a velocity that keeps only the joint
-            limits [rad/s]; 0 if no clearance inequality was active.
+        changed: norm of the difference between ``velocity`` and the velocity that would keep only the joint limits
+            [rad/s]. 0 if no clearance inequality was active.
         slack: largest violation of a clearance inequality [m/s]; 0 when all inequalities are kept.
         safe: whether ``velocity`` keeps every joint limit and every clearance inequality. If False, no joint velocity
             keeps them all.
@@ -76,8 +76,8 @@ class SafetyStep:
 class SafetyFilter:
     r"""Converts commands to joint velocities that keep the arm's limits and its clearances.
 
-    In each step, one quadratic program (:class:`~imitarm.kinematics.ik.IKSolver`) finds the joint velocity that is
-    nearest to the command and meets two conditions:
+    In each step, one quadratic program (:class:`~imitarm.kinematics.ik.IKSolver`) finds the joint velocity nearest to
+    the command. The velocity meets two conditions:
 
     * The velocity stays inside the position, velocity and acceleration limits of the joints.
     * No part of the arm approaches an obstacle faster than :class:`~imitarm.scene.clearance_limit.ClearanceLimit`
@@ -85,8 +85,8 @@ class SafetyFilter:
       at rest yields to an obstacle that moves towards it.
 
     The second condition is a set of inequalities :math:`A \dot q \ge b` for the joint velocity. If they contradict the
-    joint limits, no safe motion exists, and ``safe`` is False. The filter then ignores the command, and no distance may
-    shrink faster than during full braking:
+    joint limits, no safe motion exists, and ``safe`` is False. In this case, the filter ignores the command. No
+    distance may shrink faster than during full braking:
 
     .. math:: A\, \dot q \;\ge\; \min(b,\; A\, \dot q_b), \qquad \dot q_b = \dot q_p \max(0, 1 - dt / t_b)
 
@@ -96,7 +96,7 @@ class SafetyFilter:
     of :math:`A \dot q \ge b`. If a collision can't be avoided, the arm therefore moves away as fast as it can, or at
     least brakes as hard as it can.
 
-    Every policy and teleoperation send their commands through this filter.
+    All policies send their commands through this filter, and so does teleoperation.
 
     Args:
         arm: the arm with its tool.

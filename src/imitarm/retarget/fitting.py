@@ -8,10 +8,10 @@ tool at time t is
 where :math:`W` is the position of the person's wrist along the axes of the base, :math:`W_0` its position when the
 robot begins to follow (the clutch engages), :math:`p_0` the start position of the tool, and :math:`\rho` the scale. For
 each scale, the search places the middle of the motion at positions near the tool's home position, and then at positions
-throughout the workspace. The search reduces the scale until the arm reaches seven points of the motion: its start and
-the points with the smallest and the largest x, y and z. At these points, the tool must have the same orientation as at
-home, and the arm must be away from singularities. The links must keep a minimum distance from each other and from the
-fixtures (the objects on which the arm stands).
+throughout the workspace. The search reduces the scale until the arm reaches seven points of the motion. They are the
+start and the points with the smallest and the largest x, y and z. At these points, the tool must have the same
+orientation as at home, and the arm must be away from singularities. The links must keep a minimum distance from each
+other and from the fixtures (the objects on which the arm stands).
 """
 
 from __future__ import annotations

@@ -6,8 +6,9 @@ chain of rotations and lengths is
 
 .. math:: R = R_z(q_0) R_y(q_1) R_x(q_2)\;|\,L_U\,|\;R_y(q_3) R_x(q_4)\;|\,L_F\,|\;R_y(q_5) R_x(q_6)
 
-Sawyer's joints have the same axes in the same order when all its joint positions are zero. The joint angles of a person
-and of a Sawyer in the same posture are therefore equal, except for the effect of the offsets between Sawyer's links.
+Sawyer's joints have the same axes in the same order when all its joint positions are zero. Therefore, a person and a
+Sawyer in the same posture have nearly the same joint angles. The differences come from the offsets between Sawyer's
+links.
 """
 
 from __future__ import annotations
@@ -140,9 +141,10 @@ def _rotation_about(axis: str, angle: float) -> Array:
 def human_arm_angles(upper: ArrayLike, forearm: ArrayLike, hand: ArrayLike, previous: ArrayLike | None = None) -> Array:
     """Return the seven joint angles of a person's arm in closed form, shape (7,) [rad].
 
-    An angle that is undefined keeps its previous value. Three angles can be undefined: the first when the upper arm is
-    along z, the third when the arm is straight, and the fifth when the hand is in line with the forearm. Two sets of
-    wrist angles give the same rotation of the hand. The function returns the set that is closer to the previous angles.
+    An angle that is undefined keeps its previous value. The first angle is undefined when the upper arm is along z. The
+    third angle is undefined when the arm is straight. The fifth angle is undefined when the hand is in line with the
+    forearm. Two sets of wrist angles give the same rotation of the hand. The function returns the set that is closer to
+    the previous angles.
 
     Args:
         upper: unit vector from shoulder to elbow, shape (3,).
@@ -207,8 +209,8 @@ def hand_rotation(wrist: Array, tip: Array, thumb: Array) -> Array | None:
         thumb: position of the thumb's tip, shape (3,) [m].
 
     Returns:
-        Rotation matrix, shape (3, 3); None when the angle between hand and thumb is less than 12 degrees, or when tip
-        or thumb is too close to the wrist.
+        Rotation matrix, shape (3, 3); None if the angle between hand and thumb is less than 12 degrees, or if tip or
+        thumb is too close to the wrist.
     """
     # plain floats: for nine numbers three times as fast as NumPy
     x0, x1, x2 = (tip - wrist).tolist()

@@ -84,7 +84,7 @@ def measure_limbs(skeletons: Iterable[Skeleton], side: str = "right") -> LimbLen
         side: which arm of the person to measure, ``"left"`` or ``"right"``.
 
     Raises:
-        InputError: when fewer than five frames show the whole arm, or the lengths are not plausible.
+        InputError: when fewer than five frames show the whole arm, or a measured length is not between 0.1 and 0.6 m.
     """
     arms = [skeleton.arm(side) for skeleton in skeletons]
     whole = [arm for arm in arms if arm.confidence[:3].min() >= 1.0]
@@ -124,9 +124,9 @@ def correct_limbs(
         elbow: measured elbow position, shape (..., 3) [m].
         wrist: measured wrist position, shape (..., 3) [m].
         lengths: bone lengths of this person's arm.
-        as_printed: whether to use the equations as printed in the thesis. Their signs place the elbow on the wrong side
-            of the shoulder. In addition, the printed forearm begins at the measured elbow instead of the corrected
-            elbow.
+        as_printed: whether to use the equations as printed in the thesis. The printed signs place the elbow on the
+            wrong side of the shoulder. In addition, the printed forearm begins at the measured elbow instead of the
+            corrected elbow.
 
     Returns:
         the corrected positions of elbow and wrist, shape (..., 3) [m] each.
@@ -159,7 +159,8 @@ def fit_limbs(points: Array, confidence: Array, lengths: LimbLengths, *, rounds:
         rounds: number of Gauss-Newton steps.
 
     Returns:
-        positions of shoulder, elbow and wrist, shape (3, 3) [m]. Their distances are exactly the given lengths.
+        positions of shoulder, elbow and wrist, shape (3, 3) [m]. The distances between them are exactly the given
+        lengths.
     """
     # plain floats: for nine numbers five times as fast as NumPy
     (sx, sy, sz), (ex, ey, ez), (wx, wy, wz) = points.tolist()

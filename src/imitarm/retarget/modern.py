@@ -62,14 +62,27 @@ class ModernRetargeter(Retargeter):
     4. Limit the jerk of the joints, and limit their position, velocity and acceleration again (:class:`JerkLimiter`).
        If something blocks the arm, the arm does not push harder, and the target stays near the blocked tool.
 
-    Let :math:`\psi_0` and :math:`\psi_{h,0}` be the elbow angles of robot and person when the robot began to follow the
-    person. If the person's elbow angle is now :math:`\psi_h`, the desired elbow angle of the robot is
-    :math:`\psi_d = \psi_0 + \psi_h - \psi_{h,0}`. The weight of the elbow task decreases when the camera sees the
-    person's elbow poorly, and when the person's or the robot's arm is nearly straight.
+    Let :math:`
 
-    When the camera loses the person, the robot continues along the extrapolated motion for 0.1 s, then holds its
-    target, and stops 0.3 s after the loss. When the camera has seen the person again for half a second, the robot
-    follows again from the current poses of hand and tool. The target therefore does not jump.
+    si_0` and :math:`
+
+    si_{h,0}` be the elbow angles of robot and person when the robot began to follow the person. If the person's elbow
+    angle is now :math:`
+
+    si_h`, the desired elbow angle of the robot is :math:`
+
+    si_d =
+
+    si_0 +
+
+    si_h -
+
+    si_{h,0}`. The weight of the elbow task decreases in two cases: the camera sees the person's elbow poorly, or the
+    arm of person or robot is nearly straight.
+
+    When the camera loses the person, the robot continues along the extrapolated motion for 0.1 s. Then the robot holds
+    its target, and 0.3 s after the loss it stops. When the camera has seen the person again for half a second, the
+    robot follows again from the current poses of hand and tool. The target therefore does not jump.
 
     Args:
         arm: the robot's arm with its tool.
@@ -88,7 +101,7 @@ class ModernRetargeter(Retargeter):
         clearance: required distance between the arm and the obstacles [m].
         own_clearance: required distance between the arm's own links [m]; None: not checked.
         max_speed: largest norm of the tool's twist [m/s]; a rotation of 1 rad counts as ``rotation_length``.
-        max_lead: largest distance by which the command of a joint may be ahead of the measured position [rad]; a robot
+        max_lead: largest distance by which the command of a joint may be ahead of the measured position [rad]. A robot
             with a longer delay needs a larger value.
 
     Raises:
@@ -97,7 +110,7 @@ class ModernRetargeter(Retargeter):
 
     name: ClassVar[str] = "modern"
     caption: ClassVar[str] = (
-        "The recommended method: it keeps every limit, follows the elbow, and tolerates tracking losses."
+        "The recommended method: the robot's elbow follows the person's elbow, and every joint limit is kept."
     )
     rule: ClassVar[EngagementRule] = EngagementRule(follow_until=_BETWEEN)
 

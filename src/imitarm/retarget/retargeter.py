@@ -86,8 +86,8 @@ class Retargeter(ABC):
     4. ``_advance`` returns the joint positions of the next period. Each method has its own ``_advance``.
 
     A method is a subclass that implements ``_advance``. The subclass may also override other functions, such as
-    ``_see`` or ``_target``, which have default implementations. Its ``title`` and ``caption`` appear in tables and
-    reports::
+    ``_see`` or ``_target``, which have default implementations. The ``title`` and the ``caption`` of the subclass
+    appear in tables and reports::
 
         class Damped(Retargeter):
             name, title = "damped", "Damped least squares"
@@ -104,8 +104,8 @@ class Retargeter(ABC):
         name: name of the method, as in :data:`imitarm.retarget.RETARGETERS`; default: the class's name.
         title: title of the method in tables and reports; default: ``name``.
         caption: one sentence about the method for reports.
-        rule: how long the person must be seen before the robot follows, and how long the person may be lost until it
-            stops.
+        rule: how long the person must be seen before the robot follows, and how long the person may be lost until the
+            robot stops.
         arm: the robot's arm with its tool.
         n_joints: number of joints of the arm.
         correspondence: how the person's motion maps to the robot: side, sensor pose, scale and orientation.
@@ -176,7 +176,7 @@ class Retargeter(ABC):
     def step(self, skeleton: Skeleton | None, q: ArrayLike) -> Array:
         """Process one control period; the class describes its parts.
 
-        The first call starts at ``arm.home`` unless :meth:`start` was called.
+        If :meth:`start` was not called before, the first call starts at ``arm.home``.
 
         Args:
             skeleton: newest skeleton since the last step; None if no skeleton has arrived.

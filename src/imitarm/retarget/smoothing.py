@@ -69,7 +69,7 @@ class OneEuro:
         self.velocity: Array = np.zeros(0)
 
     def filter(self, time: float, x: Array, confidence: float | Array = 1.0) -> Array:
-        """Process measured vectors and return the smoothed vectors, same shape; ``velocity`` is their derivative.
+        """Process measured vectors and return the smoothed vectors; the attribute ``velocity`` is their derivative.
 
         Args:
             time: time of the measurement [s]; if it is not later than the previous time, the previous result is
@@ -181,8 +181,8 @@ class Hampel:
 
     Args:
         window: duration of the sliding window [s].
-        least: distance r from the median within which no value is an outlier [m]; it should exceed the distance that a
-            fast hand moves within half the window.
+        least: distance r from the median within which no value is an outlier [m]. Choose a distance larger than a fast
+            hand moves within half the window.
     """
 
     def __init__(self, window: float = 0.3, least: float = 0.02) -> None:

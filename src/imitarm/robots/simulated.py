@@ -83,8 +83,8 @@ class SimulatedRobot(Robot):
             timestep: time step of the physics and of the drives [s].
 
         Raises:
-            InputError: when ``control`` is unknown, ``timestep`` is not in (0, 0.002], ``q`` has a wrong shape or
-                is beyond the joints' limits, or a link of the arm has no usable mass.
+            InputError: when ``control`` is unknown, or ``timestep`` is not above 0 and at most 0.002 s. Also when ``q``
+                has a wrong shape or is beyond the joints' limits, or a link of the arm has no usable mass.
         """
         choice(control, get_args(Control), "control")
         timestep = finite_number(timestep, "SimulatedRobot: timestep", "s", above=0.0, at_most=0.002)
@@ -211,7 +211,7 @@ class SimulatedRobot(Robot):
         return {"contacts": frozenset(self.contacts), "contact_steps": self.contact_steps}
 
     def nearest_pair(self) -> tuple[str, str] | None:
-        """Return the names of the two geoms that define :meth:`clearance`, the arm's first; None if there are none."""
+        """Return the names of the two nearest geoms (the arm's geom first); None if no clearance was measured."""
         pair = self._gauge.measure(self.data)[1]
         return None if pair is None else self._names(pair)
 
@@ -422,8 +422,8 @@ class Drives:
     def free(self, force: Array, torque: Array, site: int) -> None:
         """Simulate one step in which a hand pulls at a site and the drives let the arm move freely.
 
-        The drives compensate the weight and 70 % of the dry friction ``c``, and add the damping ``D``:
-        ``tau = h + 0.7 c sign(v) - D v`` with the bias forces ``h`` and the joint velocity ``v``.
+        The torques are ``tau = h + 0.7 c sign(v) - D v``, where ``v`` is the joint velocity. The drives compensate the
+        torques ``h`` of gravity and Coriolis forces and 70 % of the dry friction ``c``, and add the damping ``D``.
 
         Args:
             force: force of the hand, in the base frame, shape (3,) [N].

@@ -49,9 +49,9 @@ class UdpRobot(Robot):
     """The client of a :class:`~imitarm.robots.server.RobotServer`.
 
     :meth:`move` limits the velocity in the same way as for every other robot. It then sends the resulting set-point,
-    and the server checks the set-point again. The client sends commands only if the newest state from the server is at
-    most 0.1 s old and says that the robot follows this client. Otherwise, the client sends no command and adopts the
-    server's set-point. Therefore the arm never jumps after a restart of client or server, or after an interrupted
+    and the server checks the set-point again. The client sends commands only if the robot follows this client. The
+    newest state from the server must say so and be at most 0.1 s old. Otherwise, the client sends no command and adopts
+    the server's set-point. Therefore the arm never jumps after a restart of client or server, or after an interrupted
     connection.
 
     A stopped robot moves again only after :meth:`enable`. A person must decide to call :meth:`enable`.

@@ -28,7 +28,7 @@ _FAR = 100.0  # [m] farther pairs are not measured
 def arm_world(
     arm: ArmModel, *, floor: float = -0.75, pedestal_radius: float = 0.12, fixtures: Sequence[Obstacle] | None = None
 ) -> mujoco.MjSpec:
-    """Return a world with the arm on its fixtures, to which furniture can be added; the arm's base is at the origin.
+    """Return a world with the arm on its fixtures, to which furniture can be added. The arm's base is at the origin.
 
     Args:
         arm: the arm with its tool.

@@ -139,7 +139,7 @@ class Demand(NamedTuple):
 
     Attributes:
         clearance: required distance of each pair [m].
-        gain: factor in the inequality [1/s].
+        gain: factor of the limit [1/s].
         retreat: factor that replaces ``gain`` while the distance is below the clearance [1/s].
     """
 

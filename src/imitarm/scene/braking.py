@@ -7,8 +7,8 @@ while the distance still shrinks. The remaining distance suffices if
 .. math:: h \;\ge\; w\,T + \tfrac12 w\,t \qquad\Leftrightarrow\qquad w \;\le\; \frac{h}{T + t/2} .
 
 The function :func:`shrink_rates` returns the factor 1 / (T + t/2). The safety filter
-(:class:`~imitarm.scene.clearance_limit.ClearanceLimit`) uses this factor, and so does the timing of planned paths. The
-filter therefore does not slow down a planned motion.
+(:class:`~imitarm.scene.clearance_limit.ClearanceLimit`) and the timing of planned paths use the same factor, so that
+they allow the same speeds.
 """
 
 from __future__ import annotations

@@ -35,8 +35,9 @@ _MOST_KNOWN = 64
 class SelfClearance:
     r"""Keeps the links of an arm and its tool apart from each other; neighbouring links are not checked.
 
-    The arm is covered by spheres (``ArmModel.collision_spheres``). Let spheres i and j of two links have the centres c,
-    the radii r and the Jacobians J. Their distance :math:`d` and its gradient are
+    The arm is covered by spheres (``ArmModel.collision_spheres``). Let c denote the centre, r the radius and J the
+    Jacobian of a sphere. The spheres i and j of two links have the distance :math:`d` with the gradient :math:`\nabla
+    d`:
 
     .. math:: d = |c_i - c_j| - r_i - r_j, \qquad \nabla d = n^T (J_i - J_j), \quad n = (c_i - c_j)/|c_i - c_j|
 
@@ -44,7 +45,8 @@ class SelfClearance:
     spheres. It lets the distance shrink at most exponentially towards the required clearance :math:`d_{safe}`. If the
     distance is below the clearance, it must grow, and 25/s replaces :math:`\xi`. The 64 nearest pairs of spheres have a
     row if their distance is less than the clearance plus 6 cm. In addition, each of the ``n_rows`` nearest pairs of
-    links has a row for its nearest spheres, if these are closer than the clearance plus 15 cm.
+    links has a row for its nearest spheres. This row exists only if the distance of the spheres is less than the
+    clearance plus 15 cm.
 
     Three kinds of pairs are not checked. The first are links that share a joint. The second are links that can't touch
     within their joint limits (:func:`meeting_links`). The third are spheres that are closer to each other than the
@@ -219,16 +221,16 @@ def meeting_links(arm: ArmModel) -> NDArray[np.bool_]:
     """Return, for every pair of links, whether the two links can touch within the limits of the joints between them.
 
     Link 0 is the base, and link k is moved by the first k joints. For neighbouring links, the answer is always False.
-    For links with two or three joints between them, the distance of their exact shapes is measured in 512 postures,
-    which fill the ranges of these joints evenly (a Sobol sequence). If the links touch in none of these postures, the
-    answer is False. For links with four or more joints between them, the answer is always True.
+    For links with two or three joints between them, the distance of their exact shapes is measured in 512 postures. The
+    postures fill the ranges of these joints evenly (a Sobol sequence). If the links touch in none of these postures,
+    the answer is False. For links with four or more joints between them, the answer is always True.
 
     Args:
         arm: the arm with its tool.
 
     Returns:
-        A read-only array of shape (n_joints + 1, n_joints + 1). The entry [i, j] is the answer for links i and j with i
-        > j; all other entries are False.
+        A read-only array of shape (n_joints + 1, n_joints + 1). The answer for links i and j, where i is farther from
+        the base, is the entry [i, j]. All other entries are False.
     """
     model = arm.spec().compile()
     content = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)

@@ -53,7 +53,8 @@ class ClearanceLimit:
         influence: a sphere has no row if its h is larger than this [m]. If obstacles move, the influence is extended by
             0.75 s times the speed of the fastest obstacle.
         retreat_rate: smallest rate at which a negative h must grow, divided by the magnitude of h [1/s].
-        delay: T, the control period plus the latency of the arm [s]. The time since each obstacle was seen is added.
+        delay: T, the control period plus the latency of the arm [s]. For each obstacle, the time since it was seen is
+            added to T.
         deviations: number of standard deviations of an obstacle's position along the normal to subtract from its
             distance, if the obstacle has a covariance.
 

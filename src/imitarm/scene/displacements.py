@@ -1,4 +1,4 @@
-"""Distances of many candidate positions to moving obstacles, for policies that compare them in every control step."""
+"""Distances of many candidate positions to moving obstacles, fast enough for every control step of a policy."""
 
 from __future__ import annotations
 

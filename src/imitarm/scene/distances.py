@@ -1,4 +1,4 @@
-"""Distances to all obstacles of a scene, as packed arrays.
+"""Distances of points to all obstacles of a scene, which are stored as packed arrays.
 
 For a single obstacle, use ``Obstacle.signed_distance``. The distance formulas are in the modules of the shapes.
 """

@@ -177,13 +177,13 @@ def _distance(single: _Single, p: Array, gradient: bool) -> tuple[Array, Any]:
 class Obstacle(ABC):
     """A convex solid in the base frame that must not be touched; it may move at a constant velocity.
 
-    Every shape has an exact signed distance ``sd(x)``. Its magnitude is the distance from ``x`` to the nearest surface
-    point ``s``, and its sign is positive when ``x`` is outside and negative when ``x`` is inside::
+    Every shape has an exact signed distance ``sd(x)``. The sign is positive if ``x`` is outside and negative if ``x``
+    is inside. The magnitude is the distance from ``x`` to the nearest surface point ``s``::
 
         |sd(x)| = min_s |x - s|
 
     The gradient of this distance is a unit vector. Outside, the gradient points from the nearest surface point to
-    ``x``; inside, it points from ``x`` to the nearest surface point; on the surface, it is the outward normal. Because
+    ``x``. Inside, it points from ``x`` to the nearest surface point. On the surface, it is the outward normal. Because
     the solids are convex, ``sd`` is convex. Between two points, ``sd`` changes by at most the distance between the
     points. The nearest surface point may not be unique, for example at the centre of a sphere. The gradient then refers
     to one of the nearest points, always to the same one for the same ``x``. To keep a distance ``r`` from an obstacle,

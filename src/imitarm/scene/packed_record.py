@@ -1,4 +1,4 @@
-"""Packed obstacles as a C structure, for compiled code, and packed obstacles that compiled code has placed."""
+"""Conversion of packed obstacles to a C structure for compiled code, and back from the results of compiled code."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def record_of(packed: PackedObstacles) -> tuple[Record, float]:
 
 
 def placed_by(shapes: PackedObstacles, block: Block, quaternions: Array, *kept: object) -> PackedObstacles:
-    """Return obstacles that ``track_obstacles`` in ``compiled/tracks.c`` has placed; they do not rotate.
+    """Return obstacles whose poses ``track_obstacles`` in ``compiled/tracks.c`` has computed; they do not rotate.
 
     Args:
         shapes: the same n obstacles at another time.
-        block: the C structure ``Obstacles``, then positions, velocities and angular velocities (n, 3), covariances (n,
-            3, 3), times of the last detections (n), and the square of the largest speed (1).
+        block: memory with the C structure ``Obstacles``, followed by positions, velocities and angular velocities (n, 3
+            each), covariances (n, 3, 3), times of the last detections (n), and the square of the largest speed (1).
         quaternions: rotations, shape (n, 4).
-        kept: other objects to whose memory the structure points.
+        kept: objects that own other memory to which the structure points; the result keeps them alive.
     """
     n, words, a = len(shapes), block.array, RECORD_WORDS
     fastest = math.sqrt(words.item(-1))

@@ -174,10 +174,10 @@ def _unit(vectors: Array) -> Array:
 def ellipsoids(q: Array, gradient: bool, semi_axes: Array, beyond: Array, floor: Array) -> tuple[Array, Array | None]:
     """Return distances to ellipsoids; Newton's method finds the nearest surface point and its normal.
 
-    The surface point nearest to ``y`` is ``e_j = g_j^2 y_j / (t + g_j^2)`` with semi-axes ``g``, where ``t`` is the
-    largest root of ``F(t) = sum_j (g_j y_j / (t + g_j^2))^2 - 1``. With ``s = t + min g^2`` the function ``h(s) = 1 /
-    sqrt(F + 1)`` is concave and increasing. Therefore, if Newton's method for ``h = 1`` starts to the left of the root,
-    it never steps over the root. With the unit normal ``n`` at the surface point ``e``, the distance is ``n.y -
+    Let ``g`` be the semi-axes. The surface point nearest to ``y`` is ``e_j = g_j^2 y_j / (t + g_j^2)``. Here, ``t`` is
+    the largest root of ``F(t) = sum_j (g_j y_j / (t + g_j^2))^2 - 1``. With ``s = t + min g^2`` the function ``h(s) = 1
+    / sqrt(F + 1)`` is concave and increasing. Therefore, if Newton's method for ``h = 1`` starts to the left of the
+    root, it never steps over the root. With the unit normal ``n`` at the surface point ``e``, the distance is ``n.y -
     sqrt(sum_j g_j^2 n_j^2)``. An error in ``n`` has only a quadratic effect on the distance and never makes it too
     large.
 

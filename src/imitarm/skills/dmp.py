@@ -112,8 +112,7 @@ class DMP:
     the end of the duration.
 
     **Another start or goal**: let ``p`` be the fraction of the path that has been travelled. A second primitive with
-    the weights w_p, which moves from 0 to 1, computes ``p``. The argument ``adjustment`` selects the weights of the new
-    motion:
+    the weights w_p, which moves from 0 to 1, computes ``p``. The argument ``adjustment`` has three values:
 
     * ``"progress"``: the weights are w + delta w_p, where delta is the change of g - x_0. The change of start and goal
       is thus added in proportion to ``p``. The motion therefore rests where the demonstration rests. If the distance

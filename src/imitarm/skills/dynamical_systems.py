@@ -195,8 +195,8 @@ def targets_by_step(step: Propagator, target: Array) -> Array:
 def roll_out(step: Propagator, start: Array, target: Array) -> Array:
     """Return the states after each of n steps, all computed at once.
 
-    The recursion is ``z_k = E z_(k-1) + q_k``. Each state is a sum of such terms q. Each pass over the arrays doubles
-    the number of terms that every state contains. Therefore n steps need log2(n) passes.
+    The recursion ``z_k = E z_(k-1) + q_k`` makes each state a sum with one term for each earlier step. Each pass over
+    the arrays doubles the number of terms in every state. Therefore n steps need log2(n) passes.
 
     Args:
         step: propagator of one of the n equal steps.
@@ -335,12 +335,12 @@ def fit_weights(
 ) -> FittedWeights:
     r"""Return the weights with which the primitive reproduces a path.
 
-    The motion is linear in ``d_i = w_i - (g - x_0)``. Let R be the responses of the spring: to a start position of 1,
-    to a start velocity of 1, to a goal of 1, and to each basis function. Then ``x(t) = R_start x_0 + R_rate v_0 +
-    R_goal g + sum_i d_i R_i``. The usual regression fits forces (such as ``tau v' + D v``) and needs measured
-    accelerations. This function instead fits the positions x(t) to the path. Therefore noise is not differentiated, and
-    the samples need not be evenly spaced in time. The regression minimises the position error of the reproduced motion
-    in metres.
+    The motion is linear in ``d_i = w_i - (g - x_0)``. Let ``R_start``, ``R_rate`` and ``R_goal`` be the responses of
+    the spring to a start position, a start velocity and a goal of 1. Let ``R_i`` be its response to the basis function
+    i. Then ``x(t) = R_start x_0 + R_rate v_0 + R_goal g + sum_i d_i R_i``. The usual regression fits forces (such as
+    ``tau v' + D v``) and needs measured accelerations. This function instead fits the positions x(t) to the path.
+    Therefore noise is not differentiated, and the samples need not be evenly spaced in time. The regression minimises
+    the position error of the reproduced motion in metres.
 
     The motion passes exactly through its start and its goal, which are the first and the last sample. Noise may move
     one of these samples more than 0.1 mm away from the path that fits all samples. A motion through such a sample would

@@ -58,7 +58,8 @@ class GaussianMixture:
         N_k = \sum_n h_k(z_n), \quad \pi_k = N_k / N, \quad \mu_k = \frac{1}{N_k} \sum_n h_k z_n, \quad
         \Sigma_k = \frac{1}{N_k} \sum_n h_k z_n z_n^T - \mu_k \mu_k^T
 
-    (thesis 2.2.1). The names follow scikit-learn. This class differs from scikit-learn as follows:
+    (thesis 2.2.1). The names of arguments, attributes and methods follow scikit-learn. The differences from
+    scikit-learn are:
 
     * Columns are standardised internally, so the result does not depend on the units.
     * ``init="time"`` divides column 0 into K segments such that one Gaussian describes each segment well

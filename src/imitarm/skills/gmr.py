@@ -69,9 +69,8 @@ class GMR:
     at the nearest end of the span, because an extrapolation would drift away.
 
     Args:
-        n_components: number K of Gaussians, or ``"auto"``. ``"auto"`` takes the smallest K with a small bias and an
-            error on held-out demonstrations that is about as small as with any other K
-            (:func:`~imitarm.skills.mixture_fitting.choose`).
+        n_components: number K of Gaussians, or ``"auto"``. ``"auto"`` takes the smallest K that has a small bias and
+            nearly the smallest error on held-out demonstrations (:func:`~imitarm.skills.mixture_fitting.choose`).
         candidates: the numbers of Gaussians that ``"auto"`` tries; None: 2 to 16, and larger numbers as long as the
             bias is large.
         reg_covar: see :class:`~imitarm.skills.gmm.GaussianMixture`.
@@ -319,8 +318,8 @@ class GMR:
         """Return the mean rotation and its covariance at ``times`` (n,) [s].
 
         Returns:
-            Quaternions wxyz (n, 4), and covariance (n, 3, 3) [rad^2] of the small rotation from the mean rotation to a
-            demonstrated rotation, in the base frame.
+            Quaternions wxyz (n, 4), and covariance (n, 3, 3) [rad^2]. The covariance is that of small rotation vectors
+            from the mean rotation to the demonstrated rotations, in the base frame.
 
         Raises:
             InputError: when the demonstrations had no quaternions.
@@ -410,8 +409,8 @@ def samples_of(
     If all demonstrations have rotations, these become rotation vectors relative to a common reference.
 
     Returns:
-        Tables of rows [t, x, y, z] or [t, x, y, z, r1, r2, r3], the reference of the rotations or None, and the
-        duration [s].
+        Three values: tables with rows [t, x, y, z] or [t, x, y, z, r1, r2, r3], the reference of the rotations (None
+        without rotations), and the duration [s].
 
     Raises:
         InputError: when there is no demonstration, only some have quaternions, or their rotations differ too much.
@@ -430,7 +429,7 @@ def samples_of(
     if 0 < len(without) < len(trajectories):
         raise InputError(
             f"GMR.fit: demonstrations {without} have no quaternions while the others have; "
-            "record orientation in all of them or drop it from all"
+            "record the orientation in all demonstrations, or remove it from all"
         )
     durations = np.array([trajectory.duration for trajectory in trajectories])
     duration = float(np.median(durations))

@@ -11,8 +11,8 @@ moments of ``[1; z]``. With ``P = Sigma^-1``, the inverse of M contains all part
     M = [1     mu^T             ]     M^-1 = [1 + mu^T P mu   -mu^T P]     det M = det Sigma
         [mu    Sigma + mu mu^T  ]            [-P mu            P     ]
 
-Fits that differ only in their start (restarts) or in their samples (folds of a cross-validation) are computed together,
-as further rows of the two matrix products. The samples must be standardised (each column with mean 0 and standard
+Some fits differ only in their start (restarts) or in their samples (folds of a cross-validation). The two matrix
+products compute all of these fits together. The samples must be standardised (each column with mean 0 and standard
 deviation 1), so that the sums of squares are well conditioned.
 """
 
@@ -208,11 +208,11 @@ def expectation_maximisation(
 def responsibilities_by_segments(features: Array, column: Array, numbers: Sequence[int]) -> list[Array]:
     """Divide time into K segments so that one Gaussian describes each segment well, for several K at once.
 
-    The range of ``column`` is divided into equal slots. The cost of a segment with n of the N samples and covariance
-    Sigma is ``n (log det Sigma / 2 - log(n / N))``, its negative log-likelihood under a separate Gaussian. A small
-    additional cost for the squared length of each segment makes the lengths equal if the samples do not determine them.
-    Dynamic programming over the slots finds the cheapest division for every K up to the largest. The result is
-    deterministic. EM that starts from this result needs fewer iterations than EM that starts from equal bins.
+    The range of ``column`` is divided into equal slots. The cost of a segment is its negative log-likelihood under a
+    separate Gaussian, ``n (log det Sigma / 2 - log(n / N))``. The segment has n of the N samples and the covariance
+    Sigma. A small additional cost for the squared length of each segment makes the lengths equal if the samples do not
+    determine them. Dynamic programming over the slots finds the cheapest division for every K up to the largest. The
+    result is deterministic. EM that starts from this result needs fewer iterations than EM that starts from equal bins.
 
     Args:
         features: :func:`quadratic_features` of the standardised samples, shape (F, n).
@@ -310,9 +310,9 @@ def choose(candidates: Sequence[Candidate]) -> int:
 
     * The held-out error of K is within 2 % (or 0.1 mm) of the smallest held-out error, so K generalises as well as any
       other number.
-    * The bias of K is at most a tenth of the smallest held-out error (or 0.1 mm), so the bias is small compared with
-      the differences between demonstrations. The second condition is necessary because the held-out error hardly shows
-      a bias. The square of this error is the sum of the squared bias and much larger squared differences.
+    * The bias of K is at most a tenth of the smallest held-out error (or 0.1 mm), so the bias is small. The second
+      condition is necessary because the held-out error hardly shows a bias. The squared held-out error is the sum of
+      the squared bias and the squared differences between demonstrations, which are much larger.
 
     If no K meets both conditions, only the K that meet the first condition are compared. The result is the smallest of
     these K whose bias exceeds their lowest bias by at most 10 %.
@@ -345,10 +345,10 @@ def try_numbers_of_components(
     """Evaluate several numbers of components.
 
     For each number, one fit uses all demonstrations, and each further fit leaves out one demonstration. These fits are
-    computed together. They use only a subset of the samples, which is larger for a longer path. If the tool only
-    rotates, errors are computed for a point 100 mm from the axis of rotation. The search stops when two conditions are
-    met. Four consecutive numbers of components have not reduced the held-out error by 0.5 %. One of the tried numbers
-    meets both conditions of :func:`choose`.
+    computed together. They use a subset of the samples; a longer path needs more samples. If the tool only rotates,
+    errors are computed for a point 100 mm from the axis of rotation. The search stops when two conditions are met. Four
+    consecutive numbers of components have not reduced the held-out error by 0.5 %. One of the tried numbers meets both
+    conditions of :func:`choose`.
 
     Args:
         tables: samples [t, x, y, z, ...] of each demonstration, over the same span of time.
@@ -356,8 +356,8 @@ def try_numbers_of_components(
         min_std: a column counts as constant if its standard deviation is at most this value; one value for each column,
             in the column's unit.
         reg_covar: lower bound of the eigenvalues of a covariance, relative to the variances of the columns.
-        more: further numbers to try in this order. They are tried until one fit has a bias of at most 1 % of the
-            motion's extent, and one learned path has at least 95 % of the motion's length.
+        more: further numbers to try in this order. The search ends when a fit has a bias of at most 1 % of the motion's
+            extent and a learned path has at least 95 % of the motion's length.
 
     Raises:
         InputError: when there are fewer samples than the smallest number of components.

@@ -65,7 +65,7 @@ class RhythmicDMP:
 
     Here, x is the position, tau the period, phi the phase, g the centre of the motion and r its amplitude. These
     equations are the rhythmic form of Ijspeert et al. (2013). Ridge regression on the positions gives the weights. The
-    spring's periodic response to each basis function is known exactly, because the spring multiplies the k-th Fourier
+    spring's periodic response to each basis function is known exactly. The spring multiplies the k-th Fourier
     coefficient by ``K / (K - (2 pi k)^2 + 2 pi k D i)``, where i is the imaginary unit. Rotations are represented by
     rotation vectors relative to their mean rotation. All rotations must stay within 120 degrees of the mean.
 
@@ -213,8 +213,8 @@ class RhythmicDMP:
         """Return the state ``dt`` seconds later.
 
         Args:
-            state: state returned by :meth:`begin` or by the last step; to change the motion during its execution,
-                replace the state's ``amplitude``, ``center`` or ``period``.
+            state: state returned by :meth:`begin` or by the last step. To change the motion during its execution,
+                replace ``amplitude``, ``center`` or ``period`` of the state.
             dt: [s], above 0.
             coupling: function from position and velocity to an acceleration (3,) [m/s^2] that is added during this
                 step.

@@ -49,7 +49,7 @@ class RotationReference:
 
     A rotation ``R`` near the reference ``R_ref(t)`` has the rotation vector ``r = log(R R_ref(t)^T)`` [rad] in the base
     frame. A fixed reference suffices if all rotations differ from it by clearly less than 180 degrees. Otherwise, the
-    reference must move: it is a normalised cubic spline through a few quaternions (the keys).
+    reference moves along a normalised cubic spline through a few quaternions (the keys).
 
     Attributes:
         times: times of the keys [s], strictly increasing, shape (m,); a single key is a fixed reference.
@@ -111,7 +111,8 @@ class RotationReference:
         17 or 33 instants.
 
         Args:
-            demonstrations: times (n,) [s] on a common clock, and quaternions (n, 4) wxyz, of each demonstration.
+            demonstrations: one pair for each demonstration: times (n,) [s] on a common clock, and quaternions (n, 4)
+                wxyz.
 
         Raises:
             InputError: when no such reference exists, because the rotations of the demonstrations differ too much at

@@ -292,7 +292,7 @@ class Skill:
             gmr, dmp = gmr_of(document.gmr), dmp_of(document.dmp)
             if gmr.has_orientation_ != (dmp.orientation_ is not None):
                 raise InputError(
-                    "only one of gmr and dmp has learned the rotation; both or neither must have learned it"
+                    "only one of gmr and dmp has learned the rotation, so they do not match; learn the skill again"
                 )
             quality = None
             if document.fit is not None:

@@ -55,7 +55,7 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Habits:
-    r"""Habits of one teacher. They are the same in all demonstrations by this teacher.
+    r"""Habits of one teacher, the same in all demonstrations by this teacher.
 
     The progress is :math:`p = m(w(u))` of the fraction u of the duration, with the minimum-jerk profile
     :math:`m(w) = 10 w^3 - 15 w^4 + 6 w^5` and the warp :math:`w(u) = u + e\, u (1 - u) + h \sin(2 \pi u) / (2 \pi)`.
@@ -100,7 +100,7 @@ NO_HABITS = Habits()
 
 
 def s_shaped_reach(*, planar: bool) -> Motion:
-    """Return an S-shaped reach of 0.6 m. All repeats agree at both ends and differ between the ends.
+    """Return an S-shaped reach of 0.6 m. The repeats agree at both ends and differ in the middle.
 
     Args:
         planar: whether to keep the height constant, as in a task on a table.
@@ -162,7 +162,7 @@ def demonstrations_by(motion: Motion, teachers: int, *, repeats: int = REPEATS) 
 
     Args:
         motion: motion to demonstrate.
-        teachers: number of teachers. The first teachers are the same for every number.
+        teachers: number of teachers. If the number is increased, the first teachers keep their habits.
         repeats: number of demonstrations by each teacher.
 
     Raises:

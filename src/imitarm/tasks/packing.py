@@ -265,8 +265,8 @@ def reach(start: Array, goal: Array, rise: float) -> Motion:
 def packing_skills(teachers: int = 3) -> tuple[Skill, Skill]:
     """Return the two skills of the task, learned from synthetic teachers: reach the cube, and carry it over the box.
 
-    In the demonstrations, the cube and the box are at their mean places. In a run, their places differ from these, and
-    so do the goals.
+    In the demonstrations, the cube and the box are at their mean places. In a run, the cube and the box are at other
+    places, so the goals differ from the demonstrated goals.
 
     Args:
         teachers: number of teachers, with eight demonstrations each.

@@ -64,8 +64,8 @@ def packing_policy(task: PackingTask, arm: ArmModel, grasp: Callable[[], Pose]) 
     Args:
         task: the task.
         arm: the arm with the gripper.
-        grasp: function that returns the pose of the tool in which the fingers close on the cube. It uses the last known
-            position of the cube.
+        grasp: function that returns the pose of the tool in which the fingers close on the cube. The function uses the
+            last known position of the cube.
     """
     reach, carry = packing_skills()
     spheres = arm.tool_spheres

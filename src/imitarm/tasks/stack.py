@@ -99,7 +99,7 @@ class StackTask:
 
     The colour and the dots of each cube show its number. Cube 1 stays in its place; cubes 2, 3 and 4 are stacked on
     cube 1 in this order. The task succeeds if the cubes stand in the order of their numbers, and the gripper does not
-    support them. Each cube must be centred on the cube below it, with an error of at most ``tolerance``.
+    support them. Cubes 2 to 4 must be centred on the cube below them, with an error of at most ``tolerance``.
 
     Contacts use MuJoCo's elliptic friction cones with ``impratio`` 10, because a grasped cube could otherwise slip out
     of the fingers. The setting ``condim`` 4 gives the finger pads torsional friction.
@@ -210,7 +210,7 @@ class StackTask:
         * The tower has lost a cube that was in it before.
         * A cube left the gripper in the air and is not in the tower.
         * A cube was put down outside the tower.
-        * A cube that was never lifted turned over or was pushed.
+        * A cube was pushed or turned over without having been lifted.
         * The next cube for the tower was never lifted.
         * None of these failures applies: the time limit was reached.
         """

@@ -66,7 +66,7 @@ class Habits:
     """Habits of one person in this task.
 
     Attributes:
-        delay: reaction time, from seeing an error to the start of the corrective movement, about 0.2 [s].
+        delay: reaction time (about 0.2 s) from seeing an error to the start of the corrective movement [s].
         look_every: mean time between two looks at the gripper [s]. Each look may lead to a correction.
         gain: fraction of a small error that one correction removes, below 1.
         noise: standard deviation of the random error of observed positions along each axis [m]. Each look has another
@@ -78,7 +78,7 @@ class Habits:
             hand [m].
         sense_of_lag: lag that the person expects between hand and robot, the same for every retargeter [s].
         dwell: time for which the hand rests after it has closed or opened [s].
-        height: height by which the hand rises additionally in movements over long distances [m].
+        height: additional height at which the person moves the gripper over long distances [m].
         begin: duration for which the person first holds the hand still, so that the robot can begin to follow [s].
     """
 

@@ -87,7 +87,7 @@ class Teacher:
         )
 
     def hand(self, time: float) -> tuple[Pose, Array]:
-        """Return the pose to which the hand pulls the tool at ``time`` [s], and the twist of this pose, shape (6,)."""
+        """Return the pose to which the hand pulls the tool at ``time`` [s], and the pose's twist (6,) [m/s, rad/s]."""
         t = float(np.clip(time - self.rest[0], 0.0, self.duration))
         amplitude, frequency, phase = self._tremor
         position = self._path(t) + (amplitude * np.sin(frequency * time + phase)).sum(axis=0)
@@ -97,9 +97,9 @@ class Teacher:
     def demonstrate(self, arm: ArmModel | None = None) -> tuple[Demonstration, SimulatedRobot]:
         """Guide the arm through the sweep; return the demonstration and the simulated robot at the end.
 
-        The hand pulls the tool like a spring and a damper, ``f = K (x_hand - x) + D (v_hand - v)``, and acts on the
-        tool's rotation in the same way. The arm compensates its own weight and follows the hand. The demonstration
-        contains the joint positions every 30 ms, and the corresponding poses of the tool.
+        The hand pulls the tool like a spring and a damper, ``f = K (x_hand - x) + D (v_hand - v)``. The hand turns the
+        tool in the same way. The arm compensates its own weight and follows the hand. The demonstration contains the
+        joint positions every 30 ms, and the corresponding poses of the tool.
 
         Args:
             arm: the Sawyer with the brush, if it is already loaded.

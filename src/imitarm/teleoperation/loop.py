@@ -104,16 +104,16 @@ class Teleoperation:
         source: skeletons of one person, live or replayed in real time.
         retargeter: method that converts the motion of the person's arm to the robot's motion.
         robot: robot to control.
-        safety: safety filter that checks every command. None: a filter that keeps the arm within its limits, its links
-            at least 10 mm apart, and the arm out of contact with the obstacles of the retargeter's scene.
+        safety: safety filter that checks every command. None: a filter that keeps the joint limits, keeps the links at
+            least 10 mm apart, and prevents contact with the obstacles of the retargeter's scene.
         stream: UDP stream from which ``source`` reads, used to measure latencies; None: ``source`` reads no UDP stream.
         recorder: records the robot's motion from the time when the person first moves the robot; None: no recording.
-        confirm_enable: function that decides whether a robot on a server may be enabled again. It is called as
-            ``confirm_enable(reason, stopped)`` in each step in which the robot cannot be controlled. It returns True or
-            False. None: the robot is not enabled again.
+        confirm_enable: function that decides whether a robot on a server may be enabled again. The function is called
+            as ``confirm_enable(reason, stopped)`` in each step in which the robot cannot be controlled, and returns
+            True or False. None: the robot is not enabled again.
         on_step: function called after every step.
         clock_ns: function that returns the time [ns], on the same clock as ``stream`` and ``robot``.
-        rate_limiter: timer that starts the control steps; None: a timer in real time.
+        rate_limiter: timer that starts the control steps; None: a timer that runs in real time.
     """
 
     def __init__(

@@ -27,7 +27,7 @@ _CLOCK: int | None = getattr(time, "CLOCK_BOOTTIME", None)
 def now_ns() -> int:
     """Return the current time [ns] of a clock that never goes back and that all processes of this machine share.
 
-    If the operating system offers such a clock, it also runs while the machine is suspended. A clock that stops during
+    If the operating system allows it, the clock keeps running while the machine is suspended. A clock that stops during
     a suspension would make every later datagram of this machine look delayed to its receiver.
     """
     return time.clock_gettime_ns(_CLOCK) if _CLOCK is not None else time.monotonic_ns()

@@ -65,14 +65,14 @@ class ClockOffsetEstimator:
     a datagram's sample and this minimum is the delay of the datagram.
 
     One false time stamp in the future would lower the minimum and make all other datagrams look delayed. Therefore, a
-    sample more than ``max_age / 2`` below the confirmed minimum is at first *unconfirmed*. It becomes confirmed when a
-    later datagram gives a similar sample. Even an unconfirmed sample lowers the minimum at once, so that no delayed
-    datagram is accepted as recent.
+    sample more than ``max_age / 2`` below the confirmed minimum is at first *unconfirmed*. The sample becomes confirmed
+    when a later datagram gives a similar sample. Even an unconfirmed sample lowers the minimum at once, so that no
+    delayed datagram is accepted as recent.
 
     An unconfirmed sample is rejected as a false time stamp in two cases:
 
-    * Two datagrams that arrive after the sample have earlier time stamps than the sample, although a sender's clock
-      never goes back.
+    * Two datagrams that arrive later have earlier time stamps than the sample. Then the sample must be false, because a
+      sender's clock never goes back.
     * The datagrams before and after the sample agree with the confirmed minimum. Three earlier datagrams gave samples
       near this minimum. Three later datagrams, which arrive over a period of at least ``max_age``, have a delay of at
       most ``max_age`` relative to this minimum. This case applies only while at most four samples are unconfirmed. With
@@ -173,8 +173,8 @@ class ClockOffsetEstimator:
 class DatagramFilter:
     """Accepts the datagrams of one session, each newer than the previous one and delayed by at most ``max_age``.
 
-    *Order.* A sequence number counts as newer when it is ahead of the previous one by less than half of the number
-    range, so sequence numbers may wrap around.
+    *Order.* A sequence number counts as newer if it is ahead of the previous one by less than half of the number range.
+    Therefore, sequence numbers may start again at 0 after the largest number.
 
     *Delay.* The clocks of two machines are not synchronized. The delay of a datagram is therefore measured relative to
     the fastest datagram of the last one to two minutes (:class:`ClockOffsetEstimator`).

@@ -63,7 +63,7 @@ class Canvas:
         self.svg = ""
 
     def axes(self, left: float, bottom: float, right: float, top: float, **options: Any) -> Any:
-        """Return axes whose edges have these distances from the left or lower edge of the figure [inch]."""
+        """Return axes; the arguments are the positions of their edges, from the figure's lower left corner [inch]."""
         width, height = self.size
         return self.figure.add_axes(
             (left / width, bottom / height, (right - left) / width, (top - bottom) / height), **options

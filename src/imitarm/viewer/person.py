@@ -101,7 +101,7 @@ class PersonMark:
             side: which arm the robot follows, ``"left"`` or ``"right"``.
             place: median position of the hips in the base frame: x and y [m].
             floor: height of the floor in the base frame [m].
-            name: name of the person.
+            name: name of the person, unique in the 3-D scene.
 
         Raises:
             InputError: when there is no skeleton.

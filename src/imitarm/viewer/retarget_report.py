@@ -66,7 +66,7 @@ class Measure:
         value: value in ``unit``; NaN when unknown.
         unit: unit of the value in the table.
         digits: number of decimals.
-        better: ``"less"`` or ``"more"``, whichever is better; ``""`` if neither is.
+        better: whether a smaller value (``"less"``) or a larger value (``"more"``) is better; ``""``: not defined.
         fault: whether a value above 0 is a fault; faults are marked in red.
     """
 
@@ -100,8 +100,8 @@ class MethodResult:
         tables: further tables for the tab of this method.
         notes: remarks about this run for the reader, one sentence each.
         caption: one sentence that describes the method.
-        clock: for each sample of the run, the corresponding time in the person's recording, counted from the first
-            skeleton, shape (n,) [s]; None if this time is equal to the sample's own time.
+        clock: time in the person's recording that corresponds to each sample of the run, counted from the first
+            skeleton, shape (n,) [s]. None: equal to the times of the run.
     """
 
     name: str

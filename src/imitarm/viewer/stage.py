@@ -92,7 +92,7 @@ def _vertices(recording: Recording, frame: int, bodies: Iterable[int], parts: Ma
 
 
 def points_to_see(recording: Recording, parts: Mapping[int, list[Part]], paths: Iterable[Array]) -> Array:
-    """Return points (n, 3) [m] for the camera to show: of moving bodies, their parents, paths and bodies nearby."""
+    """Return points (n, 3) [m] that must be visible: of moving bodies, their parents and neighbours, and of paths."""
     model, still = recording.model, recording.positions[:1]
     turned = np.any(np.abs(recording.quaternions - recording.quaternions[:1]) > 1e-3, axis=(0, 2))
     moves = np.any(np.abs(recording.positions - still) > 1e-3, axis=(0, 2)) | turned
