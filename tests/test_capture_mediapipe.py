@@ -78,9 +78,9 @@ def test_the_worker_is_told_what_to_read_and_may_not_import_what_lies_around(wor
     [
         (said("error is not a video that can be read"), InputError, r"film\.mp4: is not a video that can be read$"),
         ("sys.exit('no module named cv2')", InputError, "does not start.*no module named cv2.*rebuild MediaPipe.s"),
-        (said("hello world"), InputError, "did not answer as imitarm.s MediaPipe program does: 'hello world'"),
-        (said("imitarm-mediapipe 2 1280 720"), InputError, "did not answer as"),
-        (said("imitarm-mediapipe 1 wide high"), InputError, "no image size"),
+        (said("hello world"), InputError, "unexpected first line: 'hello world'; rebuild"),
+        (said("imitarm-mediapipe 2 1280 720"), InputError, "unexpected first line"),
+        (said("imitarm-mediapipe 1 wide high"), InputError, "without an image size"),
         (said("imitarm-mediapipe 1 0 720"), InputError, "needs an image size"),
         (said(HELLO, frame(0)) + "\nos.kill(os.getpid(), signal.SIGKILL)", TaskFailedError, "end.*status -9.*1 image"),
         (said(HELLO, frame(0), "error it is cut off"), TaskFailedError, "it is cut off; 1 images were processed"),

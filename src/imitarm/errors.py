@@ -10,8 +10,8 @@ from __future__ import annotations
 class ImitarmError(Exception):
     """Base class of all errors that imitarm raises deliberately.
 
-    The command line shows only the message and exits with ``exit_status``: 2 for bad input, 1 for a task that was
-    understood but could not be done.
+    The command line shows only the message and exits with ``exit_status``: 2 for invalid input, 1 for a task that
+    failed although the input was valid.
     """
 
     exit_status = 2

@@ -1,4 +1,4 @@
-"""Build the small HTML tables that notebooks display for imitarm's objects (``_repr_html_``)."""
+"""HTML tables in which notebooks display objects of imitarm (method ``_repr_html_``)."""
 
 from __future__ import annotations
 

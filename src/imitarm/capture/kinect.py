@@ -27,7 +27,7 @@ _LONGEST_WAIT = 0.5  # [s] for one call of the driver, so that Ctrl-C is noticed
 
 
 class BodyCamera(SkeletonSource):
-    """A camera whose driver delivers, in each frame, all bodies in view.
+    """A camera whose driver computes the joint positions of every person in view.
 
     Attributes:
         name: name of the camera in messages.
@@ -53,7 +53,7 @@ class BodyCamera(SkeletonSource):
 
     @property
     def over(self) -> bool:
-        """Whether the source is closed, or the camera was unplugged."""
+        """Whether the source was closed, by :meth:`close` or because the camera failed."""
         return self._over
 
     def close(self) -> None:
@@ -63,10 +63,11 @@ class BodyCamera(SkeletonSource):
             self._release()
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton, or None when none came within ``timeout`` seconds or the source has ended.
+        """Return the next skeleton; None if none arrives within ``timeout`` seconds, or if the source was closed.
 
         Raises:
-            TaskFailedError: when the driver fails, or no frame arrived for 3 s because the camera was unplugged.
+            TaskFailedError: when the driver fails, or when no frame arrives for 3 s, for example because the camera was
+                unplugged.
         """
         until = clock.monotonic() + timeout
         while not self._over and not self._waiting:
@@ -127,14 +128,14 @@ _V2_START = 10.0  # [s] within which the first frame must come: a cold camera ta
 class KinectV2Source(BodyCamera):
     """Skeletons of all persons in front of a Kinect v2, with the states of their hands.
 
-    The coordinate frame and the joints of the SDK are those of :class:`~imitarm.capture.skeleton.Skeleton`. A hand
-    state is used only when the SDK reports high confidence in it; otherwise the state is unknown. Times are on the
-    sensor's clock.
+    The coordinate frame and the joints of the SDK are those of :class:`~imitarm.capture.skeleton.Skeleton`. If the SDK
+    does not report high confidence in a hand state, the hand state is unknown. The sensor's clock provides the times of
+    the skeletons.
 
     This class was written from the documentation of `kinect-next` 3.0 and has not been tested with a real camera.
 
     Raises:
-        InputError: when driver or camera is missing; the message says which, and what to do.
+        InputError: when the driver or the camera is missing; the message names the missing part and says what to do.
         TaskFailedError: from :meth:`read`, when the camera is unplugged or the driver fails.
     """
 
@@ -212,7 +213,8 @@ class AzureKinectSource(BodyCamera):
 
     The SDK's 32 joints are converted to the 25 joints of the Kinect v2. The positions are converted from the depth
     camera's frame (x right, y down, millimetres) to the frame of :class:`~imitarm.capture.skeleton.Skeleton`. The SDK
-    does not detect whether a hand is open or closed, so hand states are unknown. Times are on the device's clock.
+    does not detect whether a hand is open or closed, so hand states are unknown. The camera's clock provides the times
+    of the skeletons.
 
     When the SDK fails, this class raises an error, whereas `pykinect-azure` would end the program. This class fetches
     frames with the C functions of the SDK, because these functions distinguish a late frame from a failure.
@@ -220,7 +222,8 @@ class AzureKinectSource(BodyCamera):
     This class was written from the documentation of the SDKs and has not been tested with a real camera.
 
     Raises:
-        InputError: when driver, SDK or camera is missing; the message says which, and what to do.
+        InputError: when the driver, the SDK or the camera is missing; the message names the missing part and says what
+            to do.
         TaskFailedError: from :meth:`read`, when the camera is unplugged or the driver fails.
     """
 

@@ -70,8 +70,8 @@ class PoseLandmarks:
     Attributes:
         time: time of the image [s].
         world: positions relative to the middle of the hips (x to the image's right, y down, z away), shape (33, 3) [m].
-        image: positions in the image, from 0 (left, top) to 1 (right, bottom), shape (33, 2); outside this range for a
-            landmark that is not in view.
+        image: positions in the image, from 0 (left, top) to 1 (right, bottom), shape (33, 2). A landmark outside the
+            image has a position below 0 or above 1.
         visibility: visibility of each landmark, 0 to 1, shape (33,).
 
     Raises:
@@ -98,17 +98,17 @@ class LandmarkConverter:
     r"""Converts landmarks to skeletons.
 
     **Position.** MediaPipe's positions in metres are relative to the hips. Without a correction, a hand at rest would
-    therefore seem to move whenever the hips move. The translation t of the hips is chosen so that the landmarks
-    :math:`X_j, Y_j, Z_j` [m] agree with the image. Let :math:`u_j, v_j` be the coordinates of landmark j relative to
-    the image's middle, in units of the focal length. Let :math:`k_j` be the visibility of the landmark, from 0 to 1.
-    The translation t solves
+    therefore seem to move whenever the hips move. The translation t of the hips is chosen so that the projections of
+    the landmarks :math:`X_j, Y_j, Z_j` [m] lie at their positions in the image. Let :math:`u_j, v_j` be the coordinates
+    of landmark j relative to the image's middle, in units of the focal length. Let :math:`k_j` be the visibility of the
+    landmark, from 0 to 1. The translation t solves
 
     .. math:: \min_t \sum_j k_j^2 \left( (X_j + t_x - u_j (Z_j + t_z))^2 + (Y_j + t_y - v_j (Z_j + t_z))^2 \right)
 
-    This problem is linear in t. Across the line of sight, t is accurate to centimetres. Along the line of sight, t is
-    noisy, and its accuracy depends on MediaPipe's scale and on the field of view. The distance along the line of sight
-    is therefore averaged over 0.1 s, and the other two components of t are then fitted again. All joints move by the
-    same t, so positions relative to other joints do not change.
+    Across the line of sight, t is accurate to centimetres. Along the line of sight, t is noisy, and its accuracy
+    depends on MediaPipe's scale and on the field of view. The distance along the line of sight is therefore averaged
+    over 0.1 s, and the other two components of t are then fitted again. The same t is added to the positions of all
+    joints.
 
     **Perspective.** MediaPipe's positions in metres assume a camera that looks straight at the person. The positions
     are therefore rotated by the angle between the camera's axis and the line of sight to the hips.
@@ -132,11 +132,14 @@ class LandmarkConverter:
         self._distance: tuple[float, float] | None = None  # time and t_z of the image before
 
     def skeleton(self, landmarks: PoseLandmarks) -> Skeleton | None:
-        """Return the skeleton; None when the person can't be located, because the image shows too little of the body.
+        """Return the skeleton; None when the person can't be located.
 
-        Each joint is computed from some landmarks. The least visible of these landmarks decides whether the joint is
-        tracked, inferred or lost. A joint outside the image is never tracked. MediaPipe does not detect whether a hand
-        is open or closed, so hand states are unknown.
+        The person can't be located if too few landmarks are visible, or if the computed distance is not between 0.3 and
+        15 m.
+
+        The position of a joint is a weighted sum of the positions of one or more landmarks. The least visible of these
+        landmarks determines whether the joint is tracked, inferred or lost. A joint outside the image is inferred or
+        lost. MediaPipe does not detect whether a hand is open or closed, so hand states are unknown.
         """
         uv = (landmarks.image - 0.5) * self._scale
         world, place = landmarks.world, None
@@ -213,15 +216,15 @@ _CHATTER = r"[IW]\d{4} |INFO: |WARNING: All log messages"  # what MediaPipe logs
 class MediaPipeSource(SkeletonSource):
     """Skeletons of the person in a video or in front of a webcam.
 
-    MediaPipe, which tracks one person, runs in another process and in another environment (see
-    :mod:`imitarm.capture.mediapipe_environment`). The process sends its landmarks as lines of text, and
-    :class:`LandmarkConverter` converts them to skeletons. The times of a video are counted from its start. For a
-    webcam, the time of a skeleton is the time at which its image arrived, on the monotonic clock.
+    MediaPipe runs in its own process and its own Python environment (see :mod:`imitarm.capture.mediapipe_environment`).
+    MediaPipe tracks only one person. The process sends landmarks as lines of text, and :class:`LandmarkConverter`
+    converts the landmarks to skeletons. For a video, the times of the skeletons start at the beginning of the video.
+    For a webcam, the time of a skeleton is the time at which the image arrived, measured by ``time.monotonic``.
 
     Args:
         film: path of a video file, or the number of a webcam.
-        realtime: whether to return the skeletons of a video at the speed of the video; otherwise, they are returned as
-            fast as MediaPipe tracks them.
+        realtime: for videos only. True: return the skeletons at the speed of the video. False: return the skeletons as
+            fast as MediaPipe tracks the person.
         field_of_view: field of view of the longer side of the image [deg].
         python: Python interpreter in whose environment MediaPipe is installed; None: the interpreter that
             :func:`~imitarm.capture.mediapipe_environment.find_python` finds.
@@ -232,7 +235,7 @@ class MediaPipeSource(SkeletonSource):
     Raises:
         InputError: when MediaPipe is not installed, the file is not a video, or there is no such webcam.
         TaskFailedError: from :meth:`read`, when MediaPipe's process dies, hangs or sends invalid lines, when the video
-            is cut off, or when the webcam is unplugged. Skeletons returned earlier remain valid.
+            is cut off, or when the webcam is unplugged.
     """
 
     def __init__(
@@ -282,7 +285,7 @@ class MediaPipeSource(SkeletonSource):
         self._process.close()
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton, or None when none arrived within ``timeout`` seconds or the source has ended."""
+        """Return the next skeleton; None if none arrives within ``timeout`` seconds, or if the source has ended."""
         until = clock.monotonic() + timeout
         while not self._over:
             if self._next is None:
@@ -337,9 +340,9 @@ class MediaPipeSource(SkeletonSource):
         if words[0] == b"error":
             raise InputError(f"{self._shown_name}: {_text(words[1:])}")
         if words[:2] != [b"imitarm-mediapipe", str(PROTOCOL).encode()] or len(words) != 4:
-            raise InputError(f"{python} did not answer as imitarm's MediaPipe program does: {_text(words)[:80]!r}")
+            raise InputError(f"{python} sent an unexpected first line: {_text(words)[:80]!r}; {_ANEW}")
         if not (words[2].isdigit() and words[3].isdigit()):
-            raise InputError(f"{python} sends no image size: {_text(words)[:80]!r}")
+            raise InputError(f"{python} sent a first line without an image size: {_text(words)[:80]!r}; {_ANEW}")
         return int(words[2]), int(words[3])
 
     def _parsed(self, words: list[bytes]) -> Skeleton | None:
@@ -367,11 +370,11 @@ class MediaPipeSource(SkeletonSource):
     def _failed(self, why: str) -> TaskFailedError:
         """Close the source, and return the error to raise."""
         self.close()
-        return TaskFailedError(f"{self._shown_name}: {why}; {self.images} images were processed before")
+        return TaskFailedError(f"{self._shown_name}: {why}; {self.images} images were processed before this failure")
 
 
 class VideoSource(MediaPipeSource):
-    """The person in a video file."""
+    """Skeletons of the person in a video file."""
 
     argument = "FILE"
     description = "the person in a video, by MediaPipe"
@@ -379,7 +382,7 @@ class VideoSource(MediaPipeSource):
 
     @classmethod
     def open(cls, argument: str, *, realtime: bool = False) -> VideoSource:
-        """Open the video file ``argument``, which a user named as ``video:FILE``.
+        """Open the video file ``argument``; the command line calls this source ``video:FILE``.
 
         Raises:
             InputError: when the file does not exist or is not a video, or when MediaPipe is not installed.
@@ -390,7 +393,7 @@ class VideoSource(MediaPipeSource):
 
 
 class WebcamSource(MediaPipeSource):
-    """The person in front of a webcam."""
+    """Skeletons of the person in front of a webcam."""
 
     argument = "NUMBER"
     description = "the person in front of a webcam, by MediaPipe; 0 is the first webcam"
@@ -398,10 +401,10 @@ class WebcamSource(MediaPipeSource):
 
     @classmethod
     def open(cls, argument: str, *, realtime: bool = False) -> WebcamSource:
-        """Open the webcam with the number ``argument``, which a user named as ``webcam:NUMBER``.
+        """Open the webcam with the number ``argument``; the command line calls this source ``webcam:NUMBER``.
 
         Raises:
-            InputError: when the text is not a number, there is no webcam with this number, or MediaPipe is not
+            InputError: when ``argument`` is not a number, there is no webcam with this number, or MediaPipe is not
                 installed.
         """
         return cls(number_after_colon("webcam", cls.argument, argument, 63))

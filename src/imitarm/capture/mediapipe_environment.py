@@ -42,9 +42,8 @@ REQUIREMENTS = (
 )
 """Packages that pose tracking needs.
 
-MediaPipe is installed with only the packages in this list, instead of all the packages that it declares as
-requirements. MediaPipe's declared requirements also include jax, sentencepiece and sounddevice, which pose tracking
-does not need.
+Only these packages are installed together with MediaPipe. MediaPipe also declares jax, sentencepiece and sounddevice as
+requirements, but pose tracking does not need them.
 """
 
 _STAMP = "imitarm-mediapipe.txt"  # written last: without it the environment is incomplete
@@ -53,7 +52,10 @@ _TRIAL = "import cv2, mediapipe; mediapipe.solutions.pose.Pose(model_complexity=
 
 
 def find_python() -> Path:
-    """Return the Python interpreter that can import MediaPipe: ``IMITARM_MEDIAPIPE_PYTHON``, or one in :func:`folders`.
+    """Return the path of a Python interpreter that can import MediaPipe.
+
+    If the environment variable ``IMITARM_MEDIAPIPE_PYTHON`` is set, its value is returned. Otherwise, the folders of
+    :func:`folders` are searched.
 
     Raises:
         InputError: when there is no interpreter that can import MediaPipe; the message says how to create the
@@ -79,8 +81,8 @@ def find_python() -> Path:
 def folders() -> list[Path]:
     """Return the folders in which the environment may be, in the order in which they are searched.
 
-    The first folder lies in the checkout of the repository, if imitarm runs from one; the other folder lies in the
-    user's data folder. A new environment is created in the first folder of the list.
+    If imitarm runs from a checkout of its repository, the first folder is in this checkout. The last folder is in the
+    user's data folder. By default, a new environment is created in the first folder of the list.
     """
     checkout = Path(__file__).resolve().parents[3]
     beside = [checkout / ".venv-mediapipe"] if (checkout / "pyproject.toml").is_file() else []
@@ -109,7 +111,7 @@ def make(folder: Path) -> Path:
         TaskFailedError: when a step fails; the message ends with the output of that step.
     """
     if folder.exists() and any(folder.iterdir()) and not (folder / "pyvenv.cfg").is_file():
-        raise InputError(f"{folder}: exists and is not a Python environment; choose a new folder")
+        raise InputError(f"{folder}: this folder exists and is not a Python environment; choose a new folder")
     python = python_of(folder)
     (folder / _STAMP).unlink(missing_ok=True)
     _run("create an environment", [suitable_python(), "-m", "venv", "--clear", str(folder)])
@@ -122,7 +124,10 @@ def make(folder: Path) -> Path:
 
 
 def suitable_python() -> str:
-    """Return the command of a Python version that MediaPipe supports: the running version, or else one on the path.
+    """Return the command of a Python interpreter whose version MediaPipe supports.
+
+    If the version of the running interpreter is not supported, the search path (``PATH``) is searched for another
+    interpreter.
 
     Raises:
         InputError: when this machine has no Python version that MediaPipe supports.
@@ -169,8 +174,8 @@ _READ, _TAIL = 20000, 600  # [characters] of its last output that are read, and 
 class LineProcess:
     """Another program whose standard output is read line by line, with a timeout.
 
-    The program must end when its standard input ends, so that it also ends when this process is killed. :meth:`close`
-    ends the program in any case, and so does deleting this object.
+    The program must exit when its standard input is closed. The program then also exits when the Python process that
+    started it is killed. Calling :meth:`close` or deleting this object ends every program.
 
     Args:
         command: command with all its arguments.
@@ -212,7 +217,7 @@ class LineProcess:
         """Return the next line without its line break, or None when no line arrived within ``timeout`` seconds.
 
         Raises:
-            EOFError: when there are no more lines.
+            EOFError: when the program's output has ended and all its lines have been returned.
         """
         return self._lines.take(timeout)
 

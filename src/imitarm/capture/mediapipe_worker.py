@@ -5,16 +5,18 @@ must not import imitarm. The class ``MediaPipeSource`` of imitarm starts the pro
 
 Each line of the output has one of these forms:
 
-* ``imitarm-mediapipe 1 WIDTH HEIGHT`` is the first line, which is sent with the first image: the version of this
-  protocol, and the size of the images in pixels.
+* ``imitarm-mediapipe 1 WIDTH HEIGHT`` is the first line. The process writes this line when it has read the first image.
+  The line contains the version of this protocol and the size of the images in pixels.
 * ``frame TIME NUMBERS`` is an image with a person. For each of 33 landmarks, NUMBERS contains the world position x y z
   [m], the image position x y (0 to 1) and the visibility.
 * ``nobody TIME`` is an image without a person.
 * ``end IMAGES`` is the last line of a video and contains the number of images.
 * ``error TEXT`` is the last line if the process can't continue.
 
-For a video, TIME is the time in the video. For a webcam, TIME is the time at which the image arrived, on the monotonic
-clock. To start the process by hand, run::
+For a video, TIME is the time in the video. For a webcam, TIME is the time at which the image arrived, measured by
+``time.monotonic``.
+
+To start the process by hand, run::
 
     .venv-mediapipe/bin/python -I src/imitarm/capture/mediapipe_worker.py video FILE
 """

@@ -44,8 +44,9 @@ def reaching(person: Person, seed: int, *, duration: float = 12.0, kind: str = "
         person: the person who moves.
         seed: seed of the random points and speeds.
         duration: duration of the motion [s]; the hand is at rest during the first second.
-        kind: ``"inside"``: all reaches end well within the workspace. ``"edge"``: every second reach stretches the arm
-            fully and stays there for some time, at or beyond the reach of a robot with the same proportions.
+        kind: ``"inside"``: every reach ends at 55 % to 85 % of the arm's length from the shoulder. ``"edge"``: at the
+            end of every second reach, the arm is fully stretched for some time. A robot arm with the same proportions
+            is then at or beyond the limit of its workspace.
 
     Raises:
         UnknownNameError: when there is no such kind.
@@ -116,9 +117,10 @@ DRAWINGS: dict[str, tuple[_Shape, tuple[float, float, float], tuple[float, float
 def drawing(person: Person, seed: int, *, duration: float = 12.0, kind: str = "circle") -> Truth:
     r"""Return the motion of a person who draws a shape repeatedly with the right hand.
 
-    At time t, the hand is at the angle :math:`\omega\,s(t)` of the shape; :math:`\omega` is the angular frequency
-    [rad/s]. The warped time s is constant during the first second and at the end. In between, s advances as fast as t.
-    In the two transitions, ds/dt follows a minimum-jerk profile between 0 and 1.
+    Each shape is a curve whose parameter is an angle [rad]. At time t, the angle is :math:`\omega\,s(t)`, where
+    :math:`\omega` is the angular frequency [rad/s]. The warped time s is constant during the first second and after the
+    end of the motion. In the second after the start, ds/dt rises from 0 to 1. In the last second, ds/dt falls from 1 to
+    0. Both transitions follow a minimum-jerk profile.
 
     Args:
         person: the person who moves.

@@ -63,11 +63,12 @@ class Person:
         forearm: distance from elbow to wrist [m].
         hand: distance from wrist to finger tip [m].
         position: position of the point on the floor between the feet, x and z in the sensor's frame, shape (2,) [m].
-        swivel: angle psi of the elbow while the hand is low, measured outwards from straight down [rad].
-        lift: increase of psi with the height of the hand [rad/m].
-        tremor: amplitude [m], frequency [rad/s] and phase [rad] of the hand's tremor, for each of n sine waves and each
-            axis, shape (3, n, 3).
-        sway: amplitude [m], frequency [rad/s] and phase [rad] of the body's sway along x and z, shape (3, 2).
+        swivel: swivel angle psi while the wrist is more than 0.3 m below the shoulder [rad].
+        lift: increase of psi per metre that the wrist rises above this height [rad/m].
+        tremor: n sine waves of the hand's tremor along each of three axes, shape (3, n, 3). The first index selects
+            amplitude [m], frequency [rad/s] or phase [rad].
+        sway: sine waves of the body's sway along x and z, shape (3, 2). The first index selects amplitude [m],
+            frequency [rad/s] or phase [rad].
     """
 
     seed: int
@@ -136,7 +137,7 @@ class Person:
         closed: bool = False,
         side: str = "right",
     ) -> Skeleton:
-        """Return the true positions of all joints when the wrist is at ``wrist``; the other arm hangs down.
+        """Return a skeleton with true positions: one arm reaches to ``wrist``, and the other arm hangs down.
 
         Args:
             time: time at which tremor and sway are evaluated [s].
@@ -145,7 +146,7 @@ class Person:
             swivel: angle psi of the elbow [rad]; None: this person's usual angle, computed from :attr:`swivel` and
                 :attr:`lift`.
             hand: rotation of the hand in the sensor's frame, shape (3, 3), with x along the hand and y towards the
-                thumb; None: in line with the forearm, with the thumb up as far as possible.
+                thumb; None: in line with the forearm, and with the thumb up when the forearm points forward.
             closed: whether the hand is a fist.
             side: side of the arm that moves.
 
@@ -172,7 +173,10 @@ class Person:
         return Skeleton(time, points, hand_states=(states["left"], states["right"]))
 
     def elbow(self, shoulder: Array, wrist: Array, swivel: float, side: str = "right") -> tuple[Array, Array]:
-        """Return elbow and wrist, (3,) [m] each. The elbow is at the angle ``swivel`` [rad], the wrist within reach."""
+        """Return the positions of the elbow, for a swivel angle [rad], and of the wrist, shape (3,) [m] each.
+
+        A wrist that is out of reach is moved along the line from the shoulder until it is within reach.
+        """
         to_wrist = wrist - shoulder
         distance = math.sqrt(to_wrist @ to_wrist)
         along = to_wrist / distance if distance > 1e-6 else _FORWARD

@@ -49,7 +49,7 @@ def time_unit_that_fits(rate: float, unit: float) -> tuple[str, float] | None:
         unit: unit in which the time stamps were read, given by its length [s].
 
     Returns:
-        The name of the unit, and the factor by which the times that were read must be multiplied; None when no unit
+        The name of the unit, and the factor by which the times must be multiplied to correct them; None when no unit
         other than ``unit`` gives a plausible frame rate.
     """
     low, high = PLAUSIBLE_RATE
@@ -81,7 +81,7 @@ def length_unit_that_fits(limb: float) -> str | None:
 
 
 def axes_that_fit(positions: Array) -> tuple[str, str] | None:
-    """Return what is wrong with the axes of positions (n, 25, 3), and the axes to use; None when the axes are correct.
+    """Return a description of the fault and the axes to use, for positions (n, 25, 3); None when the axes are correct.
 
     The axes are correct when the spine points up (y) and the trunk is in front of the sensor (z above 0). If several
     choices of axes satisfy these conditions, the function proposes axes in which the person also faces the sensor, so
@@ -157,7 +157,8 @@ def joint_steps(times: Array, positions: Array) -> tuple[Array, Array]:
 def hand_speed(times: Array, positions: Array, spikes: Mask) -> float:
     """Return the speed of the faster hand [m/s].
 
-    The speed of a hand is the 90th percentile of its mean speeds over three frames; spikes are left out.
+    The speed of a hand is the 90th percentile of its mean speeds over three frames. Mean speeds that begin or end in a
+    spike are left out.
 
     Args:
         times: time stamps, shape (n,) [s], increasing.
@@ -165,7 +166,7 @@ def hand_speed(times: Array, positions: Array, spikes: Mask) -> float:
         spikes: whether each joint is in a spike, shape (n, 25).
 
     Returns:
-        The speed; nan when neither hand has at least 10 mean speeds.
+        The speed; nan when both hands have fewer than 10 mean speeds.
     """
     speeds = []
     for wrist in (JOINT[f"wrist_{side}"] for side in SIDES):
@@ -177,17 +178,19 @@ def hand_speed(times: Array, positions: Array, spikes: Mask) -> float:
 
 
 def find_spikes(times: Array, positions: Array) -> tuple[Mask, Array]:
-    r"""Find joints that jump away for one to three frames and come back.
+    r"""Find joints that jump away for one to three frames, at most 0.25 s, and come back.
 
     Let A be the position of a joint in the last frame before a possible spike, and B its position in the first frame
-    after the spike. The joint is in a spike if it satisfies three conditions.
+    after the spike. The joint is in a spike if all three conditions hold:
 
     * The distance d of the joint from the straight line between A and B is more than 0.2 m.
     * The distance between A and B is less than d / 2.
-    * The joint moves faster than 10 m/s into the spike and out of it, or an arm bone that ends at the joint is more
-      than 0.12 m longer or shorter than in the frames before and after the spike.
+    * The joint moves faster than 10 m/s both into and out of the spike, or an arm bone that ends at the joint changes
+      its length. A change counts if the length differs by more than 0.12 m from the mean length in the frames just
+      before and after the spike.
 
-    At the beginning and at the end of a recording, any jump of more than 0.3 m at more than 10 m/s is a spike.
+    Within the first and the last three frames of a recording, any jump of more than 0.3 m at more than 10 m/s is a
+    spike.
 
     Args:
         times: time stamps, shape (n,) [s], increasing.

@@ -34,7 +34,9 @@ _GAP: Final = 0.25  # [s] a longer gap in a recording is not filled with frames
 
 
 class SkeletonRecording(SkeletonSource):
-    """Skeletons in the order in which they were recorded; a recording is also a source that replays the skeletons once.
+    """Skeletons in the order in which they were recorded.
+
+    A recording is also a source that replays its skeletons.
 
     Skeletons are neither checked nor changed: times may decrease, and there may be several persons.
     :func:`~imitarm.capture.checks.check` lists the faults.
@@ -42,14 +44,15 @@ class SkeletonRecording(SkeletonSource):
     Args:
         skeletons: skeletons in the order in which they were recorded.
         name: name of the recording in messages, for example the file's name.
-        realtime: whether to replay at the recorded speed; otherwise as fast as skeletons are read.
+        realtime: True: replay at the recorded speed. False: replay as fast as the skeletons are read.
         issues: issues found while the file was read.
-        time_unit: length of the unit of the file's time stamps [s]; used in messages about implausible times.
+        time_unit: unit of the file's time stamps, given by its length [s]. Messages about implausible times name this
+            unit.
 
     Attributes:
         skeletons: all skeletons, in the order in which they were recorded.
         issues: issues found while the file was read.
-        time_unit: length of the unit of the file's time stamps [s].
+        time_unit: unit of the file's time stamps, given by its length [s].
     """
 
     argument = "FILE"
@@ -93,7 +96,7 @@ class SkeletonRecording(SkeletonSource):
 
     @property
     def rate(self) -> float:
-        """Frames per second, from the median time between frames [Hz]; 0 with fewer than two frames."""
+        """Inverse of the median time between frames [Hz]; 0 if the recording has fewer than two frames."""
         steps = np.diff(np.unique([skeleton.time for skeleton in self.skeletons]))
         return float(1.0 / np.median(steps)) if len(steps) else 0.0
 
@@ -139,10 +142,10 @@ class SkeletonRecording(SkeletonSource):
         )
 
     def save(self, path: str | Path, *, replace: bool = True) -> None:
-        """Write the recording in imitarm's own format, from which exactly the same numbers can be read back.
+        """Write the recording in imitarm's own format, which preserves all numbers exactly.
 
         Args:
-            path: file to write; it appears under this name only when it is complete.
+            path: file to write; its name ends in ``.part`` until the file is complete.
             replace: whether an existing file may be replaced.
 
         Raises:
@@ -224,8 +227,8 @@ class SkeletonRecorder:
     """Writes each skeleton as a line of ``PATH.part``, and renames the file to ``PATH`` when the recorder is closed.
 
     Each line is handed to the operating system before :meth:`write` returns. A program that is killed therefore loses
-    at most the frame that it was writing, and :func:`read_recording` can read the remaining ``PATH.part``. An older
-    file ``PATH`` stays intact until the new one is complete.
+    at most the frame that it was writing. :func:`read_recording` can read the file ``PATH.part`` that such a program
+    leaves. An older file ``PATH`` stays intact until the new one is complete.
 
     Args:
         path: path of the file.
@@ -281,8 +284,9 @@ def slowed(skeletons: Sequence[Skeleton], pace: float) -> list[Skeleton]:
     """Slow a recording down, for a robot whose joints are slower than a person's.
 
     Frames are inserted so that the frame rate stays about the same. In an inserted frame, the joints are interpolated
-    linearly between the previous and the next original frame; a joint that is lost in one of these two frames keeps its
-    position from the previous frame. Gaps between frames are not filled, and become longer.
+    linearly between the previous and the next original frame. A joint that is lost in one of the two original frames
+    keeps its position from the previous frame. If two original frames are more than 0.25 s apart, no frames are
+    inserted between them.
 
     Args:
         skeletons: skeletons in the order of their times.

@@ -149,7 +149,7 @@ _LIMBS = {"upper arm": (0, 1), "forearm": (1, 2)}
 
 
 def guarded(recording: SkeletonRecording) -> SkeletonRecording:
-    """Return the recording after :class:`SideFilter`, which also filters the skeletons that a retargeter receives."""
+    """Return the recording after :class:`SideFilter` has undone swaps of left and right."""
     return SkeletonRecording(list(SideFilter(recording)), name=recording.name)
 
 
@@ -173,7 +173,7 @@ def bone(recording: SkeletonRecording, side: str, name: str) -> tuple[float, flo
 
 
 def arm_raised(recording: SkeletonRecording, side: str) -> dict[float, float]:
-    """Return, for each time [s], the angle between the spine and the line from shoulder to wrist [rad].
+    """Return a mapping from time [s] to the angle between the spine and the line from shoulder to wrist [rad].
 
     The angle does not depend on the position of the camera. Times are rounded to 1 ms; times at which the arm is not
     tracked are left out.
@@ -182,7 +182,10 @@ def arm_raised(recording: SkeletonRecording, side: str) -> dict[float, float]:
 
 
 def elbow_bent(recording: SkeletonRecording, side: str) -> dict[float, float]:
-    """Return, for each time [s] at which the arm is tracked, the angle between forearm and upper arm [rad]."""
+    """Return a mapping from time [s] to the inner angle at the elbow [rad]; a straight arm has the angle pi.
+
+    Times are rounded to 1 ms. Times at which the arm is not tracked are left out.
+    """
     return _angles(recording, (f"elbow_{side}", f"wrist_{side}"), (f"elbow_{side}", f"shoulder_{side}"), side)
 
 
@@ -213,11 +216,11 @@ def agreement(one: dict[float, float], other: dict[float, float]) -> tuple[float
 
 
 def wrist_difference(one: SkeletonRecording, other: SkeletonRecording) -> float:
-    """Return the RMS difference between the wrist positions in two views, each relative to the shoulder [m].
+    """Return the RMS difference of the vector from shoulder to wrist between two views of one motion [m].
 
-    The function first aligns the two views by the one rotation that fits best over the whole recording, so the
-    positions and axes of the cameras have no effect. The result is the combined error of both views; nan if the views
-    have fewer than 20 common frames.
+    The function first rotates one view so that the difference is smallest; the rotation is the same for all frames. The
+    positions and axes of the cameras therefore have no effect. The result is the combined error of both views; nan if
+    both views track an arm at fewer than 20 common times, where each arm counts separately.
     """
     found = [{round(s.time, 3): s for s in view.skeletons} for view in (one, other)]
     pairs: list[tuple[Array, Array]] = []

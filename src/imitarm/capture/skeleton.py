@@ -125,8 +125,8 @@ class Skeleton:
     The coordinate frame is that of the Kinect v2: origin in the sensor, x to the sensor's left, y up, z away from the
     sensor, right-handed. The right hand of a person who faces the sensor has a larger x than the left hand.
 
-    A joint counts as lost if its position can't have been measured, because it is not finite or farther than 20 m away.
-    The position of every lost joint is nan, so that it can't be used by mistake.
+    A joint counts as lost if its position is not finite, or if the joint is more than 20 m away from the sensor. The
+    position of every lost joint is nan.
 
     Attributes:
         time: time of the exposure, on the source's clock [s].
@@ -227,7 +227,8 @@ class SkeletonSource(ABC):
         class GloveSource(SkeletonSource):
             argument, description, live = "PORT", "a data glove at a serial port", True
 
-    Then add one line to the ``pyproject.toml`` of your package, and every command of imitarm accepts ``glove:PORT``::
+    Then declare the class in the ``pyproject.toml`` of your package. Every command of imitarm then accepts
+    ``glove:PORT``::
 
         [project.entry-points."imitarm.sources"]
         glove = "my_package.glove:GloveSource"
@@ -237,8 +238,8 @@ class SkeletonSource(ABC):
         argument: text that a user writes after the colon, for example ``"SEED"``; empty if there is no colon.
         description: one line that describes the source in ``--help``.
         live: whether the source runs until it is stopped.
-        has_realtime: whether :meth:`open` implements ``realtime``; if not, the commands replay the source in real time
-            themselves.
+        has_realtime: whether :meth:`open` implements ``realtime``. If not, :func:`~imitarm.capture.sources.open_source`
+            delays the skeletons for a replay in real time.
     """
 
     name: str = "skeletons"
@@ -264,7 +265,7 @@ class SkeletonSource(ABC):
 
     @abstractmethod
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton, or None when none arrived within ``timeout`` seconds or the source has ended."""
+        """Return the next skeleton; None if none arrives within ``timeout`` seconds, or if the source has ended."""
 
     @property
     @abstractmethod

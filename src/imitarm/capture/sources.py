@@ -15,15 +15,15 @@ def open_source(word: str | Path, *, realtime: bool = False) -> SkeletonSource:
     """Open a source of skeletons by name.
 
     Args:
-        word: path of a file, or ``NAME`` or ``NAME:ARGUMENT`` for one of :data:`~imitarm.capture.SOURCES`; if there is
-            a file with this name, the file is opened.
-        realtime: for a source that is not live, whether to replay it at the recorded speed; otherwise, it is replayed
-            as fast as the skeletons are read.
+        word: path of a recording; or the name of a source in :data:`~imitarm.capture.SOURCES`, written ``NAME`` or
+            ``NAME:ARGUMENT``. If ``word`` is the path of an existing file, the file is opened.
+        realtime: for sources that are not live. True: replay at the recorded speed. False: replay as fast as the
+            skeletons are read.
 
     Raises:
         UnknownNameError: when the name is neither the path of a file nor the name of a source.
-        InputError: when the argument after the colon is wrong, a recording can't be read, or a device or a program
-            that the source needs is missing; the message says what to do.
+        InputError: when the argument after the colon is wrong, a recording can't be read, or a required device or
+            program is missing.
     """
     kind, argument = find_source(word)
     source = kind.open(argument, realtime=realtime)
@@ -31,7 +31,7 @@ def open_source(word: str | Path, *, realtime: bool = False) -> SkeletonSource:
 
 
 def find_source(word: str | Path) -> tuple[type[SkeletonSource], str]:
-    """Return the source of this name and its argument, without opening it.
+    """Return the class of the source that ``word`` names, and the text after the colon; the source is not opened.
 
     Raises:
         UnknownNameError: when the name is neither the path of a file nor the name of a source.
@@ -71,7 +71,10 @@ def _class_of(name: str) -> type[SkeletonSource]:
 
 
 def source_words() -> dict[str, str]:
-    """Return a mapping from the word that selects a source to its description; this function imports all sources."""
+    """Return the description of each source, by the word that selects the source.
+
+    The modules of all sources are imported.
+    """
     words = {}
     for name in SOURCES:
         try:
@@ -85,7 +88,7 @@ def source_words() -> dict[str, str]:
 
 
 def is_live(word: str | Path) -> bool:
-    """Return whether the source of this name is live: it runs until it is stopped. The source is not opened.
+    """Return whether a source is live, which means that the source runs until it is stopped; the source is not opened.
 
     Raises:
         InputError: for the same reasons as :func:`find_source`.
@@ -94,7 +97,7 @@ def is_live(word: str | Path) -> bool:
 
 
 def followed(source: SkeletonSource, *, person: int | None = None) -> PersonFilter:
-    """Return a source for a retargeter: it delivers only one person of ``source``, with swaps of left and right undone.
+    """Return a source that delivers only one person of ``source``, and undoes swaps of the person's left and right.
 
     Args:
         source: opened source.

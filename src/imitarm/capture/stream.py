@@ -24,7 +24,7 @@ class SkeletonSender:
 
     Args:
         address: host and port of the receiver.
-        clock_ns: clock for the time stamps [ns].
+        clock_ns: function that returns the current time, for the time stamps [ns].
 
     Attributes:
         sent: number of skeletons sent.
@@ -79,12 +79,12 @@ def frame_of(skeleton: Skeleton, waited_ns: int = 0) -> SkeletonFrame:
 
 
 class Arrival(NamedTuple):
-    """Times at which the last skeleton was sent and received.
+    """Delays of the last received skeleton, and the time at which it was received.
 
     Attributes:
         waited: time between exposure and sending [s].
-        queued: time between sending and receiving [s]. If the sender runs on another machine, with another clock, the
-            shortest such time of the last one to two minutes is subtracted.
+        queued: time between sending and receiving [s]. If the sender runs on another machine, the clocks of the two
+            machines differ. The shortest time of the last one to two minutes is then subtracted.
         received_ns: time of receiving, on this machine's clock [ns].
     """
 
@@ -108,7 +108,7 @@ class UdpSource(SkeletonSource):
 
     Attributes:
         datagram_filter: filter that selects the datagrams to use, and counts the dropped datagrams.
-        arrival: times at which the last skeleton was sent and received; None before the first skeleton.
+        arrival: delays of the last skeleton; None before the first skeleton.
 
     Raises:
         InputError: when another program uses the port, or the address does not belong to this machine.
@@ -131,7 +131,7 @@ class UdpSource(SkeletonSource):
 
     @classmethod
     def open(cls, argument: str, *, realtime: bool = False) -> UdpSource:
-        """Listen on the port, or the address and port, that follow ``udp:`` in a user's argument.
+        """Listen for skeletons; ``argument`` is ``PORT`` or ``ADDRESS:PORT``.
 
         Raises:
             InputError: when the port is not a number or is used by another program, or the address does not belong to

@@ -17,8 +17,9 @@ MOTIONS: dict[str, Callable[..., Truth]] = {
     **{kind: partial(reaching, kind=kind) for kind in REACHES},
     **{kind: partial(drawing, kind=kind) for kind in DRAWINGS},
 }
-"""Kinds of motion, by name: each function takes a synthetic person, a seed and ``duration`` [s], and returns a
-motion."""
+"""Kinds of motion, by name: each function takes a synthetic person, a seed and ``duration`` [s], and returns the true
+skeleton as a function of time.
+"""
 
 
 class SyntheticSource(SkeletonSource):
@@ -33,7 +34,8 @@ class SyntheticSource(SkeletonSource):
         truth: true positions of all joints, as a function of time.
         camera: the simulated camera.
         duration: duration of the motion [s].
-        realtime: whether to return the skeletons in real time, as a camera does; otherwise as fast as they are read.
+        realtime: True: return the skeletons in real time, as a camera does. False: return them as fast as they are
+            read.
         name: name of the source in messages.
 
     Attributes:
@@ -85,7 +87,9 @@ class SyntheticSource(SkeletonSource):
 
     @classmethod
     def open(cls, argument: str, *, realtime: bool = False) -> SyntheticSource:
-        """Return the synthetic person with the seed ``argument``, which a user named as ``synthetic:SEED``.
+        """Return the synthetic person with the seed ``argument``.
+
+        The command line calls this source ``synthetic:SEED``.
 
         Raises:
             InputError: when the seed is not a whole number.

@@ -34,7 +34,7 @@ from imitarm.policies import POLICIES
 from imitarm.policies.adaptation import ADAPTERS
 
 OTHERS = (add_static, add_moving, add_tracking, add_perception)
-"""Functions that add the parsers of those benchmarks that have a file of their own."""
+"""Functions that add the subcommands whose code is in another module."""
 
 EPILOG = """\
 examples:
@@ -129,9 +129,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     other.set_defaults(benchmark=_avoidance)
     third = parsers.add_parser(
         "refusals",
-        help="check by an independent search (oracle) that planned paths are clear, and that no path was overlooked",
+        help="check planned paths and refusals with an independent search for a path",
     )
-    third.add_argument("--scenes", type=int, default=1000, metavar="N", help="how many; default: 1000")
+    third.add_argument("--scenes", type=int, default=1000, metavar="N", help="number of scenes; default: 1000")
     third.add_argument("--first", type=int, default=0, metavar="N", help="first seed; default: 0")
     third.add_argument("--skills", type=Path, nargs="+", default=[], metavar="FILE", help="additional skills to adapt")
     add_fill(third)
@@ -189,7 +189,7 @@ def _add_placements(parsers: Any) -> None:
     placed.set_defaults(benchmark=_placements)
     compared = parsers.add_parser(
         "comparison",
-        help="from saved results, compare a policy with each other policy in placements that the other policy solved",
+        help="read saved results, and compare one policy with each other policy where the other one succeeded",
     )
     compared.add_argument(
         "results", type=Path, nargs="+", metavar="RESULTS", help="files that 'placements --out' wrote"
@@ -364,7 +364,7 @@ def _placements(arguments: argparse.Namespace) -> int:
 
 
 def _comparison(arguments: argparse.Namespace) -> int:
-    """Print what saved results of placements say about a policy and its baselines."""
+    """Compare a policy with the other policies, from saved results of placements, and print the comparison."""
     place = place_of(arguments, "comparison")
     results = list(load_results(arguments.results).values())
     tables_found = placement_comparison.comparison_tables(results, arguments.policy)
@@ -419,9 +419,9 @@ def _check(arguments: argparse.Namespace, folder: Path) -> None:
     if arguments.data is not None and not arguments.data.is_dir():
         raise InputError(f"--data {arguments.data}: there is no such folder")
     if folder.exists() and not folder.is_dir():
-        raise InputError(f"--out {folder}: is not a folder; name another one")
+        raise InputError(f"--out {folder}: is not a folder; name another path")
     if arguments.data is not None and same_place(folder, arguments.data):
-        raise InputError(f"--out {folder}: is also the folder of --data; name another one")
+        raise InputError(f"--out {folder}: is also the folder of --data; name another folder")
     written = [("--out", folder / name) for name in ("mapping.md", "mapping.json")]
     check_outputs([("--report", arguments.report)], [("--fill", arguments.fill), *written], new_folders=True)
     if arguments.report is None:
@@ -434,7 +434,7 @@ def _check(arguments: argparse.Namespace, folder: Path) -> None:
         page.absolute().parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(
-            f"--report {page}: its folder can't be created ({error.strerror}); name another one"
+            f"--report {page}: its folder can't be created ({error.strerror}); name another file"
         ) from error
     from imitarm.viewer.page import check_writable  # noqa: PLC0415 (draws: needs an extra)
 

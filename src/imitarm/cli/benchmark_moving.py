@@ -52,7 +52,11 @@ def add_moving(parsers: Any) -> None:
     )
     moving.add_argument("--dimensions", nargs="+", type=int, choices=(2, 3), default=[2, 3], help="default: 2 3")
     moving.add_argument(
-        "--count", type=int, default=100, metavar="N", help="scenes of each family and dimension; default: 100"
+        "--count",
+        type=int,
+        default=100,
+        metavar="N",
+        help="number of scenes of each family in each dimension; default: 100",
     )
     moving.add_argument(
         "--first", type=int, default=first, metavar="N", help=f"first seed; {first} to {end - 1} are for tests"
@@ -64,9 +68,9 @@ def add_moving(parsers: Any) -> None:
         help=f"policies and reference methods; default: {' '.join(default_methods())}",
     )
     for name, default, unit, text in (
-        ("noise", 5.0, "MM", "standard deviation of a measured position"),
+        ("noise", 5.0, "MM", "standard deviation of the measured positions of obstacles"),
         ("rate", 30.0, "HZ", "measurements per second"),
-        ("latency", 33.0, "MS", "delay of a measurement"),
+        ("latency", 33.0, "MS", "delay of the measured positions"),
         ("dropout", 0.0, "PERCENT", "probability that an obstacle is missed in a frame"),
         ("occlusions", 0.0, "HZ", "number of occlusions per second; each lasts 0.5 s"),
     ):

@@ -75,7 +75,7 @@ def run_with_progress(
     *,
     fresh: bool,
 ) -> Finished[Outcome]:
-    """Run experiments with a progress bar; results of an earlier run are used unless ``fresh`` is set.
+    """Run experiments with a progress bar; if ``fresh`` is False, saved results are reused.
 
     The bar is called ``name``. The other arguments are those of :func:`~imitarm.benchmark.running.run_experiments`.
     """

@@ -19,7 +19,9 @@ def add_perception(parsers: Any) -> None:
     parser = parsers.add_parser(
         "perception", help="compare obstacles detected in depth images with the true obstacles in the simulator"
     )
-    parser.add_argument("--count", type=int, default=105, metavar="N", help="scenes of each family; default: 105")
+    parser.add_argument(
+        "--count", type=int, default=105, metavar="N", help="number of scenes of each family; default: 105"
+    )
     parser.add_argument("--first", type=int, default=2000, metavar="N", help="first seed; default: 2000")
     parser.add_argument("--families", nargs="+", choices=FAMILIES, default=list(FAMILIES), metavar="NAME")
     parser.add_argument("--height", type=int, default=120, metavar="N", help="rows of the images; default: 120")

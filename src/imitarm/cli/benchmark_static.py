@@ -69,13 +69,21 @@ def add_static(parsers: Any) -> None:
         nargs="+",
         default=[],
         metavar="FILE",
-        help=f"put the obstacles on the paths of these skills, in the families {' '.join(ANY_SKILL)}",
+        help=f"skill files; the obstacles are placed on the paths of the skills, in the families {' '.join(ANY_SKILL)}",
     )
     static.add_argument(
-        "--torque", type=int, default=0, metavar="N", help="in the first N scenes of a family, also compute torques"
+        "--torque",
+        type=int,
+        default=0,
+        metavar="N",
+        help="also compute joint torques in the first N scenes of each family",
     )
     static.add_argument(
-        "--memory", type=int, default=0, metavar="N", help="in the first N scenes of a family, also measure memory use"
+        "--memory",
+        type=int,
+        default=0,
+        metavar="N",
+        help="also measure memory use in the first N scenes of each family",
     )
     _add_running(static)
     static.set_defaults(benchmark=_run)
@@ -84,7 +92,11 @@ def add_static(parsers: Any) -> None:
     solvable = [family for family in FAMILIES if family != COVERED]  # no draw could succeed in the others
     _add_scenes(tuning, count=5, split="validation", families=solvable)
     tuning.add_argument(
-        "--draws", type=int, default=DRAWS, metavar="N", help=f"option sets per method; default: {DRAWS}"
+        "--draws",
+        type=int,
+        default=DRAWS,
+        metavar="N",
+        help=f"number of option sets tried for each method; default: {DRAWS}",
     )
     tuning.add_argument("--save", type=Path, metavar="FILE", help="file of the best options; default: DIR/tuned.json")
     _add_running(tuning)
@@ -92,12 +104,18 @@ def add_static(parsers: Any) -> None:
     scaling = actions.add_parser("scaling", help="vary the number of obstacles (1 to 20) and of tool spheres (1 to 16)")
     scaling.add_argument("--methods", nargs="+", default=[OURS], metavar="NAME", help=f"default: {OURS}")
     scaling.add_argument(
-        "--count", type=int, default=10, metavar="N", help="scenes for each of these numbers; default: 10"
+        "--count",
+        type=int,
+        default=10,
+        metavar="N",
+        help="number of scenes for each number of obstacles or spheres; default: 10",
     )
     scaling.add_argument("--first", type=int, default=2000, metavar="N", help="first seed; default: 2000")
     add_fill(scaling)
     scaling.set_defaults(benchmark=_scaling)
-    refusals = actions.add_parser("refusals", help=f"check each refusal of {OURS} by a search (oracle)")
+    refusals = actions.add_parser(
+        "refusals", help=f"check with an independent search whether a path exists where {OURS} refused"
+    )
     _add_scenes(refusals, count=100, split="test", methods=False)
     _add_running(refusals)
     add_fill(refusals)
@@ -128,7 +146,10 @@ def _add_scenes(
 ) -> None:
     if methods:
         parser.add_argument(
-            "--methods", nargs="+", metavar="NAME", help="policies that plan a whole path, and controls; default: all"
+            "--methods",
+            nargs="+",
+            metavar="NAME",
+            help="policies that plan a whole path, and reference methods; default: all",
         )
     parser.add_argument(
         "--families",
@@ -140,7 +161,11 @@ def _add_scenes(
     )
     parser.add_argument("--dimensions", nargs="+", type=int, choices=(2, 3), default=[2, 3], help="default: 2 3")
     parser.add_argument(
-        "--count", type=int, default=count, metavar="N", help=f"scenes of each family and dimension; default: {count}"
+        "--count",
+        type=int,
+        default=count,
+        metavar="N",
+        help=f"number of scenes of each family in each dimension; default: {count}",
     )
     first, end = SPLITS[split]
     text = f"first seed; seeds {first} to {end - 1} are for {split}"
@@ -180,9 +205,10 @@ def experiments_of(arguments: argparse.Namespace) -> list[StaticExperiment]:
 
 
 def _scenes_of_skills(arguments: argparse.Namespace) -> list[tuple[str, tuple[str, int, int]]]:
-    """Return the file of the skill and the scene of each experiment; scenes for which a path is too short are left out.
+    """Return the name of the skill file and the scene of each experiment.
 
-    Without ``--skill``, the file is empty.
+    Without ``--skill``, the name is empty. A scene is left out if the path of the skill is too short for the obstacles
+    of the scene.
     """
     if not arguments.skill:
         return [("", scene) for scene in _scenes(arguments)]
@@ -197,7 +223,8 @@ def _scenes_of_skills(arguments: argparse.Namespace) -> list[tuple[str, tuple[st
     found = [(skill, scene) for skill, scene in wanted if _exists(skill, scene)]
     if len(found) < len(wanted):
         remark(
-            f"left out {len(wanted) - len(found)} of {len(wanted)} scenes: the path is too short for their obstacles"
+            f"left out {len(wanted) - len(found)} of {len(wanted)} scenes: the skill's path is too short for their "
+            "obstacles"
         )
     return found
 

@@ -1,4 +1,4 @@
-"""``imitarm benchmark tracking``: how well the tracker follows real motion, and how often its margins suffice."""
+"""``imitarm benchmark tracking``: test the tracker and its safety margins on real motion."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def add_tracking(parsers: Any) -> None:
     """Add the parser of the command."""
     parser = parsers.add_parser(
         "tracking",
-        help="measure how well the tracker follows real motion, and how often its margins suffice (thesis Fig 5.9)",
+        help="test the tracker and its safety margins on real motion (thesis Fig 5.9)",
     )
     parser.add_argument(
         "--data",
@@ -30,7 +30,11 @@ def add_tracking(parsers: Any) -> None:
         help="folder of real recordings, with the subfolders mocap_arm and mocap_trolley",
     )
     parser.add_argument(
-        "--windows", type=int, default=5000, metavar="N", help="short synthetic motions for the margins; default: 5000"
+        "--windows",
+        type=int,
+        default=5000,
+        metavar="N",
+        help="number of short synthetic motions that test the margins; default: 5000",
     )
     parser.add_argument(
         "--noise", type=float, default=5.0, metavar="MM", help="standard deviation of detected positions; default: 5"

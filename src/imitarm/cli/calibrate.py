@@ -48,8 +48,8 @@ _ORIENTATIONS: dict[Orientation, str] = {
     "fixed": "the tool does not rotate",
 }
 _ANCHORS: dict[Anchor, str] = {
-    "shoulder": "the robot's arm is stretched when your arm is stretched; uses the robot's whole workspace, but is "
-    "less precise",
+    "shoulder": "the robot's arm is stretched when your arm is stretched; uses the robot's whole "
+    "workspace, but is less precise than 'object'",
     "object": "the tool moves 1 cm when the hand moves 1 cm; for objects that you and the robot both have in front "
     "of you",
 }
@@ -70,7 +70,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     limbs = kinds.add_parser("limbs", help="measure the lengths of upper arm and forearm")
     add_source(limbs)
     limbs.add_argument(
-        "--seconds", type=float, default=5.0, metavar="S", help="duration, for a live source; default: 5"
+        "--seconds",
+        type=float,
+        default=5.0,
+        metavar="S",
+        help="duration of the measurement with a live source; default: 5",
     )
     sensor = kinds.add_parser(
         "sensor", help="locate the sensor in the robot's base frame, from points that your hand touches"
@@ -190,7 +194,7 @@ def _read_pairs(path: str) -> tuple[list[list[float]], list[list[float]]]:
 
 
 def _columns(path: str, names: Sequence[str]) -> list[list[float]]:
-    """Return the columns called ``names``; without column names, the table must have exactly these columns."""
+    """Return the columns called ``names``; a table without column names must have exactly these columns."""
     table = read_table(path)
     if table.names is not None:
         lower = [name.lower() for name in table.names]
@@ -295,7 +299,7 @@ def ask(question: str) -> str:
 
 
 def choose(question: str, choices: Mapping[Word, str]) -> Word:
-    """Ask until the answer is one of the choices: its number, or the beginning of its name.
+    """Ask until the answer selects one choice, by its number or by the beginning of its name.
 
     Raises:
         InputError: when the input has ended, so that nobody can answer.
@@ -344,7 +348,7 @@ def touched_points(
             f"Move the robot's tool to each of the {len(points)} points, and there put the palm of your {side} "
             f"hand on the tool's tip."
         )
-        remark("The sensor must see the hand. Then hold still and press Enter. Type s to skip a point, q to quit.")
+        remark("Keep the hand in view of the sensor. Hold still and press Enter. Type s to skip a point, q to quit.")
     seen: dict[int, list[float]] = {}
     for i in wanted:
         place = " ".join(f"{100 * value:.1f}" for value in points[i])
@@ -371,7 +375,7 @@ def touched_points(
 
 
 def _measured(source: SkeletonSource, side: str, seconds: float) -> tuple[list[float] | None, str]:
-    """Return the position of the hand (3,) [m] and an empty text; if the measurement failed, None and the reason."""
+    """Return the position of the hand (3,) [m] and an empty text; after a failed measurement, None and the reason."""
     while source.read(0.0) is not None:  # skeletons from before Enter
         pass
     taken, _ = gather(source, seconds, "measuring", live=True)

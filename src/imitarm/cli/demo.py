@@ -31,7 +31,7 @@ examples:
   imitarm demo --out demo_7 --seed 7
   imitarm demo --out thesis --scenes T1 T2 T3 T4 T5 T6 T7 T8
 
-The package contains eight demonstrations of a sweep, in which a synthetic teacher guides the simulated Sawyer by hand.
+The package contains eight demonstrations: a synthetic teacher guides the simulated Sawyer by hand to sweep a table.
 The command checks and aligns the demonstrations, and learns a skill from them.
 The command then reproduces the skill in seven scenes.
 One scene has no obstacles, four have standing obstacles, and two have moving obstacles.
@@ -135,7 +135,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def packaged_demonstrations() -> list[Demonstration]:
-    """Return the packaged demonstrations of the sweep."""
+    """Return the demonstrations of sweeping that are part of the package."""
     paths = sorted(DEMONSTRATIONS.glob("*.csv"))
     return [replace(Demonstration.load(path), source=path.name) for path in paths]  # no folder names in the skill file
 

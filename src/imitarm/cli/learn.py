@@ -139,8 +139,9 @@ def _learn(demonstrations: list[Demonstration], arguments: argparse.Namespace, n
 def _samples_needed(demonstrations: Sequence[Demonstration]) -> int:
     """Return the number of samples of each aligned demonstration.
 
-    The number is 200 if no path is longer than 6 times its extent. For a longer path, the number grows in proportion to
-    the path length, up to 2000.
+    The extent of a path is the diagonal of the smallest box around the path. If no path is longer than 6 times its
+    extent, the number is 200. Otherwise, the number grows in proportion to the largest ratio of path length to extent,
+    up to 2000.
     """
     most = 1.0
     for one in demonstrations:

@@ -25,13 +25,13 @@ def check_outputs(
 
     Args:
         outputs: option and file of each output; if the file is None, the output is not written.
-        inputs: name and value of each input: the option or argument that gives it, and its file or source name.
+        inputs: for each input, the name of the option or argument, and its value: a file or the name of a source.
         force: whether existing files may be replaced; None if the command has no option ``--force``.
         new_folders: whether the command creates missing folders.
 
     Raises:
-        InputError: when an output is a folder, when its folder is missing, when it is also an input or another output,
-            or when it exists and may not be replaced. An HTML page of ``--report`` may always be replaced.
+        InputError: when an output is a folder, its folder is missing, it is also an input or another output, or it
+            exists and may not be replaced. An HTML page of ``--report`` may always be replaced.
     """
     taken = [(name, file) for name, word in inputs if word is not None for file in _files(word)]
     for option, path in outputs:

@@ -86,11 +86,12 @@ def gather(
 
     Args:
         source: source of the skeletons.
-        seconds: duration [s], measured by the clock for a live source, otherwise by the skeletons' times; None: to the
-            end.
+        seconds: duration [s]. A clock measures the duration of a live source; otherwise, the times of the skeletons are
+            used. None: until the source ends.
         what: text of the progress bar, for example ``"capturing"``.
         live: whether the source runs until it is stopped.
-        total: expected duration of the source [s], for the progress bar; unused if ``seconds`` is given; None: unknown.
+        total: expected duration of the source [s], for the progress bar; None: unknown. If ``seconds`` is given,
+            ``total`` is not used.
         on_skeleton: function called with each skeleton.
 
     Returns:
@@ -139,8 +140,8 @@ def person_of(arguments: argparse.Namespace, side: str) -> tuple[list[Skeleton],
         side: which of the person's arms the robot follows, ``"left"`` or ``"right"``.
 
     Returns:
-        The skeletons; the changes and issues, one sentence each; and, if the source is synthetic, the person's true
-        motion.
+        The skeletons; the changes and issues, one sentence each; and the person's true motion, or None if the source is
+        not synthetic.
 
     Raises:
         InputError: when the source or an option is wrong.

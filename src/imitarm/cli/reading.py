@@ -27,7 +27,7 @@ def add_reading_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "files", nargs="+", metavar="FILE", help=f"demonstrations, or folders of them; formats: {', '.join(READERS)}"
     )
-    unsaid = parser.add_argument_group("for values that the files do not state")
+    unsaid = parser.add_argument_group("values that the files do not state")
     unsaid.add_argument("--units", choices=LENGTH_UNITS, help="unit of lengths; default: what the file states, else m")
     unsaid.add_argument(
         "--time-units", choices=TIME_UNITS, help="unit of time stamps; default: what the file states, else s"

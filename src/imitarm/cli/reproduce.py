@@ -42,7 +42,7 @@ examples:
 
 The arm is simulated with its inertias and limits.
 The simulator measures the clearance between its own shapes of the arm and of the obstacles.
-The exit status is 1 if no path keeps the required clearance, if the arm touched something, or if it did not finish.
+The exit status is 1 if no path keeps the clearance, if the arm touched something, or if the motion did not finish.
 """
 
 _NEAREST_CAMERA = 0.7  # [m] from the middle of the path
@@ -87,7 +87,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="skill of another demonstrated path of the same task (see 'imitarm learn --each-path'); acfra follows the "
         "path that needs the smallest displacement; may be repeated",
     )
-    avoid.add_argument("--method", choices=ADAPTERS, help="how acfra adapts the path; default: certified")
+    avoid.add_argument(
+        "--method", choices=ADAPTERS, help="method by which the policy acfra adapts the path; default: certified"
+    )
     avoid.add_argument(
         "--clearance", type=float, default=20.0, metavar="MM", help="required distance to every obstacle; default: 20"
     )
@@ -199,7 +201,10 @@ def run(arguments: argparse.Namespace) -> int:
 def _observer(
     arguments: argparse.Namespace, truth: MovingScene, robot: SimulatedRobot, skill: Skill
 ) -> Callable[[float], Scene] | None:
-    """Return the function by which the policy observes the scene; None: the scene at the start and its velocities."""
+    """Return the function by which the policy observes the scene.
+
+    None: the policy uses the scene at the start, in which obstacles keep their velocities.
+    """
     scene = truth.scene
     if arguments.camera is not None:
         path = skill.gmr_.trajectory(100).positions

@@ -126,7 +126,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Setting:
-    """The input that all methods share: the arm, its start posture, the correspondence and the obstacles."""
+    """The input that all methods share: robot arm, start posture, relation between person and robot, and obstacles."""
 
     arm: ArmModel
     q: NDArray[np.float64]
@@ -199,7 +199,10 @@ def _output_files(arguments: argparse.Namespace, names: Sequence[str]) -> dict[s
 
 
 def _correspondence(arguments: argparse.Namespace) -> Correspondence:
-    """Return the correspondence of person and robot: from the options, else from the calibration, else the default."""
+    """Return the person's arm, the scale and the orientation with which the robot follows the person.
+
+    A value comes from the options, else from the calibration, else from the defaults.
+    """
     calibration = Calibration() if arguments.calibration is None else Calibration.load(arguments.calibration)
     found = calibration.correspondence()
     if calibration.orientation is None:  # a camera sees the hand's rotation poorly
@@ -271,7 +274,7 @@ def _result(name: str, evaluation: RunEvaluation, execution: Execution | None) -
 
 
 def _demonstration(made: Retargeting, task: str, source: str, whole: bool) -> Demonstration:
-    """Return as a demonstration the part in which the robot followed the person; with ``whole``, the whole run."""
+    """Return a demonstration of the time in which the robot followed the person, or of the whole run if ``whole``."""
     engaged = np.flatnonzero(made.engaged)
     first, last = (0, len(made.times) - 1) if whole else (max(int(engaged[0]) - 1, 0), int(engaged[-1]))
     part = slice(first, max(last, first + 1) + 1)
@@ -328,7 +331,8 @@ def _torques(evaluation: RunEvaluation) -> PlainTable:
         ("Joint", "Mean", "Weight", "Motion", "RMS", "Rated"),
         tuple(rows),
         "Torques are computed by inverse dynamics, without friction. Weight: the torque that holds the arm against "
-        "gravity; motion: the rest. The means are taken over absolute values, so the two parts need not add up to "
+        "gravity. Motion: the remaining torque. The means are taken over absolute values, so weight and motion need "
+        "not add up to "
         "the whole torque.",
     )
 

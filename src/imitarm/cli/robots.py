@@ -23,7 +23,9 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
-    parser.add_argument("arm", nargs="?", metavar="ARM", help="the same as --robot; default: list all known arms")
+    parser.add_argument(
+        "arm", nargs="?", metavar="ARM", help="arm to show, as with --robot; default: list all known arms"
+    )
     add_robot_options(parser, default=None)
 
 

@@ -63,7 +63,8 @@ def run_scene(
         tool_spheres: spheres of the tool for drawing, instead of ``tool_radius``: rows x, y, z, radius, shape (m,
             4) [m].
         demonstrations: aligned demonstrations; the measured motion is compared with them.
-        evaluate: success test of the task; it returns the rollout with success and reason.
+        evaluate: function that tests whether the task succeeded. It takes the robot and the rollout, and returns the
+            rollout with ``success`` and ``reason``.
         observe: function that takes the time since the start [s] and returns the scene that the policy sees; None: the
             scene at the start, in which obstacles keep their velocities.
         caption: one sentence that describes the scene.
@@ -132,10 +133,10 @@ def _details(rollout: Rollout | None, policy: Policy) -> dict[str, object]:
 
 
 def _distance_to(demonstrations: Sequence[Demonstration], rollout: Rollout | None, phases: Sequence[float]) -> float:
-    """Return the root mean square distance [m] of the measured tool to all demonstrations at the same phase.
+    """Return the root mean square distance from the measured tool positions to all demonstrations [m].
 
     The formula is thesis Eq 4.9, with the square root that the printed equation lacks. Positions are compared at the
-    same phase, not at the same time, so that waiting does not count as inaccuracy.
+    same phase (completed fraction of the motion), not at the same time, so that waiting does not count as inaccuracy.
     """
     if rollout is None or not demonstrations or not phases:
         return float("nan")
@@ -151,7 +152,7 @@ def _distance_to(demonstrations: Sequence[Demonstration], rollout: Rollout | Non
 def learning_summary(
     skill: Skill, demonstrations: Sequence[Demonstration], findings: Sequence[Finding], alignment: Alignment | None
 ) -> LearningSummary:
-    """Return what the report says about the learning of the skill."""
+    """Return the part of the report that describes how the skill was learned."""
     gmr = skill.gmr_
     predicted: Trajectory = gmr.trajectory(200)
     return LearningSummary(
@@ -211,7 +212,8 @@ def show_results(report: Report) -> None:
     show_table(headings, rows, styles=styles)
     remark(
         "Clearance: smallest measured distance between the arm (with tool) and any obstacle [mm]. Certified: "
-        "guaranteed lower bound of the clearance on the planned path [mm]; with --tool-only, it is for the tool only. "
+        "guaranteed lower bound of the clearance on the planned path [mm]; with --tool-only, the bound holds only for "
+        "the tool. "
         "RMSE: root mean square distance to the demonstrations [mm]. Unmoved: fraction of the Gaussian components "
         "that were not moved. Adaptation: computing time [ms]."
     )

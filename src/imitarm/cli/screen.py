@@ -56,7 +56,7 @@ def show_table(
 
 
 def working(what: str) -> Status:
-    """Show an activity indicator while the ``with`` block runs; silent when stderr is not a terminal."""
+    """Show an activity indicator while the ``with`` block runs, if stderr is a terminal."""
     return _console(sys.stderr).status(what)
 
 

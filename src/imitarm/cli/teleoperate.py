@@ -173,7 +173,7 @@ def _connected(arm: ArmModel, address: str) -> UdpRobot:
 
 
 def _enable_prompt(arguments: argparse.Namespace, tell: Callable[[str], None]) -> EnablePrompt | None:
-    """Return the prompt that enables a served robot; None for a robot in this process, which needs no enabling."""
+    """Return the prompt for enabling a robot of ``imitarm serve``; None for a robot simulated in this process."""
     return EnablePrompt(tell, enable_first=arguments.enable) if arguments.to else None
 
 

@@ -52,7 +52,7 @@ def build() -> str:
 
 @cache
 def library() -> Any:
-    """Return the compiled library; None if it was not built, or was built from other sources."""
+    """Return the compiled library; None if it was not built, or if its sources have changed since it was built."""
     try:
         found = ctypes.CDLL(str(LIBRARY))
         for name, arguments in _FUNCTIONS.items():
@@ -67,7 +67,7 @@ def address(array: NDArray[Any]) -> int:
     """Return the memory address of an array; the caller must keep the array as long as it uses the address.
 
     Raises:
-        ValueError: when the numbers of the array do not follow each other in memory.
+        ValueError: when the array is not contiguous in memory.
     """
     try:
         return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]  # the fastest way
@@ -98,10 +98,11 @@ class Block:
 class Record:
     """A C structure of whole numbers (``int64_t``), real numbers (``double``), arrays, and lists of other structures.
 
-    A field for an array holds the address of the array. A field for a list holds the address of a list of addresses, or
-    0 for None.
+    A field for an array holds the address of the array. A field for a list holds the address of a list. The list
+    contains the address of each structure, and 0 for each None.
 
-    The record keeps a reference to each field. A copy in another process contains the addresses of that process.
+    The record keeps all its arrays in memory. If a record is sent to another process, it is rebuilt there with new
+    addresses.
 
     Attributes:
         address: address of the structure.

@@ -39,20 +39,20 @@ class CameraObserver:
     because each image contains its own pose. The joint positions are recorded at every call. The detector removes the
     arm from each image, and needs the joint positions of the time at which the image was taken.
 
-    **A frozen camera.** An image is ignored unless its time stamp is later than the stamp of the previous image. If the
-    newest image is older than ``max_age``, the obstacles are no longer predicted, and the scene keeps the stamp of the
-    newest image. From this stamp, a watchdog can compute the age of the scene. Before the first image arrives, the
-    scene is empty, and its stamp is the time of the first call.
+    **A frozen camera.** Only an image with a later time stamp than the previous image is used. If the newest image is
+    older than ``max_age``, the obstacles are no longer predicted, and the scene keeps the stamp of the newest image.
+    From this stamp, a watchdog can compute the age of the scene. Before the first image arrives, the scene is empty,
+    and its stamp is the time of the first call.
 
     **A camera that was moved.** Once per second, the surfaces in an image are compared with the known places of these
     surfaces (:meth:`~imitarm.perception.ObstacleDetector.camera_error`). If they are not at their known places in two
-    successive comparisons of one camera, the call raises an error, and the control loop brakes the robot.
+    successive comparisons of one camera, ``observe(t)`` raises TaskFailedError. The control loop then brakes the robot.
 
     The time must not decrease from one call to the next, because a camera can't take images of the past.
 
     Args:
-        cameras: one function or several functions that return a new image, or None if there is none, for example
-            ``DepthCamera.frame``.
+        cameras: one function for each camera, for example ``DepthCamera.frame``. The function returns a new image, or
+            None if there is no new image.
         detector: detector that finds the obstacles in an image.
         tracker: :class:`~imitarm.perception.ObstacleTracker` that receives these obstacles.
         joints: function that returns the current joint positions (n_joints,) [rad]; required if the detector removes an
@@ -60,8 +60,9 @@ class CameraObserver:
         rate: images per second of each camera [Hz].
         latency: time from the exposure to the arrival of an image [s].
         max_age: age of the newest image at which the cameras count as frozen [s].
-        clock: stamp of an image minus the time of a call at the same instant [s]; for a simulated robot, the stamp of
-            the scene in which the robot started.
+        clock: difference between the clocks of images and of calls [s]: the stamp of an image minus the time ``t`` at
+            the same instant. For a simulated robot, the difference is the stamp of the scene in which the robot
+            started.
         goal: goal of the returned scenes.
         fixtures: fixtures (known obstacles that do not move) of the returned scenes.
 

@@ -63,9 +63,9 @@ class ContactDetector:
     Args:
         arm: model of the arm with its tool, including all masses.
         threshold: external torque of each joint that counts as a contact, one number or shape (n_joints,) [N m]; None:
-            0.15 times the rated torque (10 N m for a joint without one) plus the dry friction of the joint. With this
-            default, no contact is reported if the tool is 5 % heavier than in the model, or carries a payload of half a
-            kilogram.
+            0.15 times the rated torque of the joint (10 N m if no rated torque is known), plus the dry friction of the
+            joint. With this default, a tool that is 5 % heavier than in the model, or a payload of half a kilogram, is
+            not reported as a contact.
         gain: gain K of the observer [1/s].
 
     Attributes:
@@ -93,7 +93,7 @@ class ContactDetector:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the motion so far."""
+        """Restart the observer: forget all states received so far."""
         self._last: ArmState | None = None
         self.residual: Array = np.zeros(self.arm.n_joints)
 

@@ -17,7 +17,8 @@ class Intervention:
         count: number of these steps.
         first: time of the first of these steps [s].
         last: time of the last of these steps [s].
-        room: smallest difference between distance and required clearance in these steps [m]; negative when too close.
+        room: smallest value of distance minus required clearance in these steps [m]; negative if the required clearance
+            was violated.
         unsafe: number of these steps in which no safe motion existed.
     """
 

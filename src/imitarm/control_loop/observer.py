@@ -1,7 +1,8 @@
 """Simulated observation of a moving scene by a camera and a tracker: noisy, late, and with gaps.
 
-:class:`SensorModel` simulates the camera, and :class:`TrackedScene` converts its detections to a scene by a tracker. A
-:class:`TrackedScene` can be the argument ``observe`` of :func:`~imitarm.control_loop.reproduce`.
+:class:`SensorModel` simulates the camera. :class:`TrackedScene` passes the detections to a tracker, and returns the
+scene that the tracker estimates. A :class:`TrackedScene` can be the argument ``observe`` of
+:func:`~imitarm.control_loop.reproduce`.
 """
 
 from __future__ import annotations
@@ -138,7 +139,7 @@ class SensorModel:
 
 @lru_cache(maxsize=256)
 def _anonymous(obstacle: Obstacle) -> Obstacle:
-    """Return a copy at rest without name and track, which no sensor sees."""
+    """Return a copy of an obstacle without the attributes that a sensor can't measure, such as name and velocity."""
     zero = np.zeros(3)
     return replace(obstacle, name="", track_id=None, covariance=None, velocity=zero, angular_velocity=zero)
 

@@ -35,8 +35,8 @@ class PersonObserver:
             :data:`PERSON_NOISE`.
         latency: time from the exposure to the arrival of a skeleton [s].
         max_age: age of the newest skeleton at which the camera counts as frozen [s].
-        start: time on the clock of the calls at which the first skeleton was measured [s]; None: the skeletons' times
-            are already on the clock of the calls.
+        start: time of the first skeleton on the clock of ``observe(t)`` [s]; the times of all skeletons are shifted
+            accordingly. None: the times are not shifted.
 
     Attributes:
         n_skeletons: number of skeletons that were used.

@@ -82,21 +82,20 @@ def reproduce(
             and the whole arm out of contact with obstacles. The filter's ``dt`` must equal this ``dt``.
         watchdog: slows the arm down and stops it while no new scenes arrive; None: a
             :class:`~imitarm.control_loop.watchdog.Watchdog` with its default times.
-        contact: detects contacts from the torques of the joints; True: a
-            :class:`~imitarm.control_loop.contact.ContactDetector` with its default thresholds, if the masses of the arm
-            are known; False: contacts are not detected.
+        contact: detector of contacts. True: a :class:`~imitarm.control_loop.contact.ContactDetector` with its default
+            thresholds, if the masses of the arm are known. False: contacts are not detected.
         on_step: function called after each step, for progress or drawing; if the function raises an exception, the
             robot is stopped and the exception is raised again.
 
     Returns:
         The measured motion from rest to rest. Its attribute ``success`` means that the motion finished in time, touched
         nothing, and kept the clearance that the filter requires. Its ``details`` contain the commanded ``"twists"`` (n,
-        6) and several counts. The count ``"clamped"`` says how often each limit changed a command. The count
-        ``"filtered"`` is the number of steps in which the filter changed a command to keep a clearance, and
+        6) and several counts. ``"clamped"`` contains the number of commands that each limit of the robot changed. The
+        count ``"filtered"`` is the number of steps in which the filter changed a command to keep a clearance, and
         ``"unsafe"`` is the number of steps without a safe motion. ``"interventions"`` is a tuple of
         :class:`~imitarm.control_loop.interventions.Intervention`, which name the parts that came close to each other.
-        ``"contact"`` is the detected :class:`~imitarm.control_loop.contact.Contact`, or None. The count ``"statuses"``
-        is the number of steps with each status of the policy. The details also contain the entries of the robot's
+        ``"contact"`` is the detected :class:`~imitarm.control_loop.contact.Contact`, or None. ``"statuses"`` contains
+        the number of steps with each status of the policy. The details also contain the entries of the robot's
         :meth:`~imitarm.robots.robot.Robot.report`. The attribute ``reason`` names contacts and what the safety filter
         did.
 

@@ -10,8 +10,9 @@ cheapest monotone path through the grid of costs ``c(i, j) = |a_i - b_j|^2`` fol
     D(i, j) = c(i, j) + min(D(i-1, j-1) + c(i, j), D(i-1, j) + p, D(i, j-1) + p)
 
 This is the symmetric form of Sakoe and Chiba (1978), in which a diagonal step counts twice. D(i, j) is the cost of the
-cheapest path from (0, 0) to (i, j). The price ``p`` of a step that is not diagonal keeps noise from distorting time,
-and the band limits |i - j|. The code computes all cells of one anti-diagonal together, for all pairs of motions.
+cheapest path from (0, 0) to (i, j). The price ``p`` of a step that is not diagonal keeps noise from distorting time.
+The band is the largest allowed |i - j|. The code computes all cells of one anti-diagonal together, for all pairs of
+motions.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ class Alignment:
         demonstrations: demonstrations with common times from 0 to ``duration``.
         duration: common duration of the aligned demonstrations, the median of the trimmed demonstrations' durations
             [s].
-        kept_rows: index of the first and of the last row that trimming kept of each demonstration, shape
+        kept_rows: indices of the first and the last row of each demonstration that remain after trimming, shape
             (n_demonstrations, 2).
         durations: duration of each trimmed demonstration before alignment [s], shape (n_demonstrations,).
         warps: for each sample of an aligned demonstration, the time of the same point in the trimmed demonstration,
@@ -195,7 +196,7 @@ def noise_level(values: Array) -> float:
 
 
 def turns(quaternions: Array) -> Array:
-    """Return for each sample the sum of the rotation vectors of all steps up to this sample, shape (n, 3) [rad]."""
+    """Return the sum of the rotation vectors of all steps up to each sample, shape (n, 3) [rad]."""
     q = continuous_signs(quaternions)
     steps = quaternion_log(quaternion_multiply(q[1:], quaternion_conjugate(q[:-1])))
     return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
@@ -249,7 +250,11 @@ def _moving(times: Array, values: Array, still: float) -> tuple[int, int] | None
 
 
 def held_rows(values: Array) -> NDArray[np.bool_]:
-    """Return whether each row of recorded ``values`` (n, d) repeats the previous row by sample and hold, shape (n,)."""
+    """Return whether each row of ``values`` (n, d) repeats the previous row, shape (n,).
+
+    Rows repeat if the recorder samples faster than the sensor measures. If a motion contains too few repeated rows, or
+    the values change in coarse steps, no row counts as repeated.
+    """
     none = np.zeros(len(values), dtype=bool)
     steps = np.abs(np.diff(values, axis=0))
     same = np.asarray(~(steps > 0.0).any(axis=1))
@@ -402,9 +407,9 @@ def barycentre_warps(values: Array, *, band: float = 0.2, stiffness: float = 1.0
 
     The first barycentre is the medoid: the motion nearest to all others. Each round matches every motion with the
     barycentre by :func:`dtw` and smooths the matched times into a warp. The mean of the warped motions is the
-    barycentre of the next round. Petitjean et al. (2011) average in the same way, but with sets of matched samples in
-    place of a smooth warp for each motion. The warps are centred: their mean changes no time. Therefore the common
-    speed profile is the mean of all speed profiles, not the profile of the medoid.
+    barycentre of the next round. The method of Petitjean et al. (2011) uses sets of matched samples; here, each motion
+    has a smooth warp instead. The warps are finally centred, so that the mean of all warps leaves time unchanged. The
+    common speed profile is therefore the mean of all speed profiles, not the profile of the medoid.
 
     Args:
         values: features, shape (n_demonstrations, n, d), evenly spaced in time.

@@ -1,4 +1,4 @@
-"""Find out what each column of a table holds, from the column names or, without names, from the number of columns.
+"""Determine the meaning of each column of a table, from the column names or from the number of columns without names.
 
 An unknown unit is an error. A rotation that can't be read, such as Euler angles, is reported and left out.
 """
@@ -125,7 +125,8 @@ class Column:
             ``joint``; empty if the name is unknown.
         unit: unit that the column name states, in lower case; None if the name states no unit.
         joint: name of the joint, without prefixes such as ``position.``.
-        not_angle: what the column of a joint holds if it does not hold joint angles, for example ``"velocities"``.
+        not_angle: what the column of a joint contains instead of joint angles, for example ``"velocities"``; empty for
+            joint angles.
     """
 
     what: str
@@ -246,7 +247,7 @@ def named_columns(
 
 
 def _with_tum_positions(columns: list[Column], names: Sequence[str]) -> list[Column]:
-    """Return the columns; ``tx ty tz`` become positions if there is also a quaternion, as in trajectory files of TUM.
+    """Return the columns; ``tx ty tz`` become positions if there is also a quaternion, as in the TUM trajectory format.
 
     If the table has no quaternion, or if it also has forces, ``tx ty tz`` may be torques and do not become positions.
     """
@@ -299,7 +300,7 @@ def _of_matrices(source: str, elements: Array) -> Array:
 
 
 def _unread_rotation(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of columns that seem to hold a rotation in a form that can't be read, such as Euler angles."""
+    """Return the names of columns that seem to contain a rotation in an unsupported form, such as Euler angles."""
     plain = [_plain(name) for name in names]
     in_sets = {word for words in _ROTATION_SETS if set(words.split()) <= set(plain) for word in words.split()}
     if in_sets == {"q1", "q2", "q3", "q4"} and {"q5", "q6"} & set(plain):
@@ -344,7 +345,8 @@ def _one_unit(
 ) -> str | None:
     """Return the unit that all ``columns`` share.
 
-    A remark in the file may state a unit; this unit ``elsewhere`` applies to columns whose names state no unit.
+    ``elsewhere`` is the unit that a remark in the file states, or None. This unit applies to columns whose names state
+    no unit.
     """
     found = {units[i] or elsewhere for i in columns}
     if None in found and len(found) > 1:
@@ -423,7 +425,7 @@ def unnamed_columns(
 
 
 def order_notes(options: ReadOptions, said: SaidUnits | None = None) -> tuple[str, ...]:
-    """Return a note about the assumed order of quaternions, unless the file or an option states the order."""
+    """Return a note about the assumed order of quaternions; no note if the file or an option states the order."""
     if options.quaternion_order is not None or (said is not None and said.quaternion_order is not None):
         return ()
     return ("the quaternion columns have no names, so the order w x y z was assumed; the other order is x y z w",)

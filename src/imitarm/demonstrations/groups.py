@@ -27,11 +27,12 @@ _COMPACT_RATIO = 5.0  # likewise for groups that are compact
 
 
 def group_by_path(demonstrations: Sequence[Demonstration]) -> list[list[Demonstration]]:
-    """Divide demonstrations of one task into groups that take the same path, so that a skill can be learned from each.
+    """Divide demonstrations of one task into groups that take the same path.
 
-    The paths are aligned, and moved to a common start and goal. Two demonstrations belong to different groups if the
-    distance between their paths exceeds 20 % of the motion's size. If each group has at least 3 demonstrations, a
-    distance of 5 % is enough, provided that it is at least 5 times as large as the distances within the groups.
+    The paths are aligned, and moved to a common start and goal. The size of a path is the diagonal of the smallest box
+    around it, and the size of the motion is the median over all paths. Two demonstrations belong to different groups if
+    the distance between their paths exceeds 20 % of the size of the motion. A distance of 5 % is enough if each group
+    has at least 3 demonstrations and the distance is at least 5 times as large as the distances within the groups.
 
     Args:
         demonstrations: demonstrations that run in the same direction between similar ends; see
@@ -69,7 +70,7 @@ def split_paths(distance: Array, size: float) -> tuple[NDArray[np.bool_], float]
 
     Args:
         distance: largest distance between each pair of paths, shape (m, m) [m].
-        size: size of the motion [m].
+        size: size of the motion, see :func:`group_by_path` [m].
 
     Returns:
         A mask that is true for the demonstrations of one group, shape (m,), and the gap between the groups [m].
@@ -112,7 +113,7 @@ def two_groups(
         floor: smallest gap between groups, in the unit of ``distance``.
         ratio: smallest ratio of the longest edge to the second longest.
         others_too: whether to ignore ``ratio`` if the second longest edge also exceeds ``floor``. In this case, there
-            are more than two groups, and the longest edge separates one from the rest.
+            are more than two groups, and the longest edge separates one or more groups from the others.
 
     Returns:
         A mask that is true for the demonstrations of one group, shape (m,), and the gap, in the unit of ``distance``.

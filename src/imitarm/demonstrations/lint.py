@@ -1,9 +1,9 @@
 """Lint: list the faults of demonstrations before a skill is learned from them.
 
 Each check yields findings. The checks in this module examine each motion by itself, and compare the motions with each
-other. The mean of several demonstrations is useful only if these agree. If some run backwards, stop early, end
-elsewhere or take another path, the mean is a motion that nobody demonstrated. Checks of the numbers in a file are in
-``raw.py``. Checks of units, and of a motion against an arm, are in ``plausibility.py``.
+other. The mean of several demonstrations is useful only if the demonstrations agree. If some of them run backwards,
+stop early, end elsewhere or take another path, the mean is a motion that nobody demonstrated. Checks of the numbers in
+a file are in ``raw.py``. Checks of units, and of a motion against an arm, are in ``plausibility.py``.
 """
 
 from __future__ import annotations
@@ -301,7 +301,7 @@ def _mean_distance(paths: Array, others: Array) -> Array:
 
 
 def _backwards(paths: Array, size: float, motions: Sequence[ValidRows], scale: _Scale) -> Iterator[_Odd]:
-    """Find motions that run backwards: reversed, they are much nearer to the most typical motion."""
+    """Find motions that run backwards: after reversal, they are much nearer to the most typical motion."""
     forward, backward = _mean_distance(paths, paths), _mean_distance(paths[:, ::-1], paths)
     typical = int(np.argmin(forward.sum(axis=1)))
     differs = forward[:, typical] > max(scale.smallest, _DIFFERENT * size)
@@ -333,7 +333,7 @@ def _incomplete(paths: Array, size: float, motions: Sequence[ValidRows], scale: 
 
 
 def _groups(motions: Sequence[ValidRows], positions: Array, rotations: Array | None, size: float) -> Iterator[Finding]:
-    """Find demonstrations that form two groups, which differ in start, goal, path from start to goal, or rotation."""
+    """Find two groups of demonstrations that differ in start, goal, path from start to goal, or rotation."""
     between = to_common_ends(positions)
     kinds: list[tuple[str, Severity, str, Array, float, float, str]] = [
         ("ends", "warning", "starts", largest_distances(positions[:, :1]), _ENDS_APART * size, 1e3, "mm"),
@@ -412,7 +412,7 @@ def _outliers(motions: Sequence[ValidRows], positions: Array, rotations: Array |
 
 
 def _unlike(distance: Array, center: int, floor: float) -> list[int]:
-    """Return the demonstrations that are unusually far from the medoid ``center``, given their distances (n,)."""
+    """Return the demonstrations whose ``distance`` (n,) from the demonstration ``center`` is unusually large."""
     others = np.delete(distance, center)
     usual = float(np.median(others))
     spread = 1.4826 * float(np.median(np.abs(others - usual)))

@@ -96,7 +96,7 @@ def check_units(motion: ValidRows) -> Iterator[Finding]:
 
 
 def _remedy(raw: RawDemonstration, kind: str, option: str, fits: list[tuple[str, str]], otherwise: str) -> str:
-    """Return the remedy that names the units that fit; an option can't replace a unit that the file states."""
+    """Return the remedy: an option with a unit that fits, or a correction of the unit that the file states."""
     if not fits:
         return otherwise
     if kind in raw.units_in_file:
@@ -169,9 +169,9 @@ def _check_reach(motion: ValidRows, arm: ArmModel) -> Iterator[Finding]:
 def reach(arm: ArmModel, *, n_samples: int = 400, seed: int = 0) -> tuple[Array, float]:
     """Return the shoulder of an arm, and the largest distance between the shoulder and the tool's tip.
 
-    The shoulder is the point on the first joint's axis that is nearest to the second joint's axis. The distance is
-    found by gradient ascent within the joint limits from random postures, so it is a close lower bound of the true
-    reach.
+    The shoulder is the point on the first joint's axis that is nearest to the second joint's axis. Gradient ascent
+    within the joint limits, from random postures, finds the distance. The result can be slightly smaller than the true
+    reach, but not larger.
 
     Args:
         arm: arm with its tool.

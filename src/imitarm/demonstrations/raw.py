@@ -79,7 +79,7 @@ class RawDemonstration:
     quaternions whose length is not one. ``lint`` checks the raw demonstration instead, so that it can list all faults.
 
     Attributes:
-        source: name of the file; if the file contains several demonstrations, also which of them this is.
+        source: name of the file. If the file contains several demonstrations, an index or a name follows.
         times: time stamps in any order, shape (n,) [s].
         positions: positions of the tool in the base frame, shape (n, 3) [m]; None when only joints were recorded.
         quaternions: quaternions wxyz, not necessarily of length one, shape (n, 4); None when not recorded.
@@ -92,7 +92,7 @@ class RawDemonstration:
             angles.
         length_unit: unit of the lengths in the file, from which ``positions`` were converted.
         time_unit: unit of the times in the file, from which ``times`` were converted.
-        units_in_file: ``"length"``, ``"time"``, both or neither: the units that the file itself states.
+        units_in_file: quantities whose units the file itself states: ``"length"``, ``"time"``, both or neither.
 
     Raises:
         InputError: when an array has the wrong shape or does not contain numbers, or joints and names do not agree.
@@ -305,7 +305,7 @@ def _unit(raw: RawDemonstration, keep: NDArray[np.int64]) -> Array:
     length = np.linalg.norm(quaternions, axis=1)
     bad = np.flatnonzero(np.abs(length - 1.0) > _LENGTH_TOLERANCE)
     if len(bad):
-        what = f"the quaternion has length {length[bad[0]]:.3g}, must be 1; check which columns hold it"
+        what = f"the quaternion has length {length[bad[0]]:.3g}, must be 1; check which columns hold the quaternion"
         raise FileFormatError(f"{raw.where(int(keep[bad[0]]))}: {what}")
     return np.asarray(quaternions / length[:, None])
 

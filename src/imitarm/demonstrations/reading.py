@@ -270,8 +270,8 @@ def read(
             file states, else wxyz.
         arm: arm that was recorded, with its tool; needed for files that contain only joint angles.
         task: name of the task; used if the file does not state a task.
-        repair: whether to drop rows with numbers that are not finite, and rows that are not later than the previous
-            row. The ``source`` of the demonstration states how many rows were dropped.
+        repair: whether to drop rows with numbers that are not finite, and rows whose time stamp is not later than that
+            of the previous row. The ``source`` of the demonstration states how many rows were dropped.
         thin: whether to drop rows that only repeat the previous row (see :meth:`RawDemonstration.held`).
 
     Returns:

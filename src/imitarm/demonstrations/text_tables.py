@@ -40,7 +40,11 @@ _NATIVE_MARK = re.compile(rb"(?:\xef\xbb\xbf)?(?:\s*[#%][^\n]*\n)*?\s*[#%]\s*for
 
 
 class ImitarmReader(Reader):
-    """Reads imitarm's own CSV format: remarks with units and frame; columns t x y z, quaternion and joints."""
+    """Reads imitarm's own CSV format.
+
+    Remarks state the units and the frame. The columns contain the time, the tool's position and quaternion, and the
+    joint positions.
+    """
 
     suffixes = (".csv",)
 

@@ -53,7 +53,7 @@ class Execution:
     """Measurements on a simulated robot that executed a retargeted motion.
 
     Attributes:
-        error_rms: root mean square over time of the position error of the worst joint [rad].
+        error_rms: root mean square over time of the largest position error of any joint [rad].
         error_max: largest position error of a joint [rad].
         peak_torque_ratio: largest torque of a drive, relative to the rated torque.
         limited: number of frames in which a limit of the robot changed a command.

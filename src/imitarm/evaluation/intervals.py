@@ -54,7 +54,7 @@ Values = Mapping[tuple[int, Any], float]
 
 
 def person_means(values: Values) -> Array:
-    """Return one mean for each person, in the order of the persons; recordings without a value are left out."""
+    """Return the mean of each person, in the order of the persons; recordings without a value are left out."""
     persons: dict[int, list[float]] = {}
     for (person, _), value in sorted(values.items(), key=lambda item: (item[0][0], str(item[0][1]))):
         if math.isfinite(value):
@@ -210,11 +210,11 @@ def rate_interval(outcomes: Values) -> Interval:
     weight of two persons. If all trials had the same result, or if there is only one person, the correlation is set to
     0.3. :math:`N / D` lies between the number of persons and N.
 
-    With this rule alone, one more failure could make the interval narrower: if only one person fails, the persons seem
-    to differ; if a second person fails as well, they seem to be alike. To prevent this effect, the function also
-    computes the interval of every result that is at least as good as ``outcomes`` in each trial, and returns the lowest
-    of the lower ends. In the same way, it computes the interval of every result that is at least as bad as ``outcomes``
-    in each trial, and returns the highest of the upper ends.
+    With this rule alone, one more failure could make the interval narrower. For example, the persons seem to differ if
+    only one person fails, but seem to be alike if a second person fails as well. To prevent this effect, the function
+    also computes the interval of every result that is at least as good as ``outcomes`` in each trial, and returns the
+    lowest of the lower ends. In the same way, it computes the interval of every result that is at least as bad as
+    ``outcomes`` in each trial, and returns the highest of the upper ends.
 
     Args:
         outcomes: outcome of each trial, 1 for success, 0 for failure.
@@ -243,7 +243,7 @@ def _lower_end(rates: Array, each: float, step: int) -> float:
     Args:
         rates: success rate of each person, shape (n,).
         each: average number of trials per person.
-        step: the sum of the rates is raised in steps of ``1 / step``.
+        step: number of steps in which the sum of the rates is raised by 1.
     """
     own = np.sort(rates)[::-1]
     room = 1.0 - own

@@ -42,11 +42,11 @@ class MappingMetrics:
     """The measures of a retargeting run. Unknown values are nan.
 
     An *engagement* is a period in which the robot is in one of the states "following", "coasting" and "holding";
-    docs/retargeting.md describes these states. Errors of tool and elbow are relative to a reference: the clutch law,
-    applied to the person's *true* hand from the start of the engagement. The clutch law moves the tool by the scaled
-    displacement of the hand. Each engagement has a new reference. Errors are averaged over the engaged frames only, so
-    compare them together with ``engaged_fraction``. Only ``tool_rms_from_first`` includes all frames after the first
-    engagement.
+    docs/retargeting.md describes these states. Errors of tool and elbow are relative to a reference motion. The clutch
+    law computes the reference from the person's *true* hand: it moves the tool by the scaled displacement of the hand
+    since the start of the engagement. Each engagement has a new reference. Errors are averaged over the engaged frames
+    only, so compare them together with ``engaged_fraction``. Only ``tool_rms_from_first`` includes all frames after the
+    first engagement.
 
     Attributes:
         duration: duration of the robot's motion [s].
@@ -250,7 +250,7 @@ def _settling(
     correspondence: Correspondence,
     true: TrueArm | None,
 ) -> float:
-    """Return the settling time of the tool at the mean of the method's targets in the last half second."""
+    """Return the settling time [s]; the final target is the mean of the method's targets in the last half second."""
     if true is None or not periods.engaged.any():
         return math.nan
     late = run.times >= run.times[-1] - _REST

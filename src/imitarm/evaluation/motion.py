@@ -31,7 +31,7 @@ class ArmMotion:
         quaternions: rotations of the tool, wxyz, shape (n, 4).
         sew: shoulder, elbow and wrist, shape (n, 3, 3) [m]; nan for an arm without these landmarks.
         torques: torques required for the motion, from inverse dynamics, shape (n, n_joints) [N m].
-        gravity: part of ``torques`` that holds the arm's weight, shape (n, n_joints) [N m].
+        gravity: torques that hold the arm at rest against gravity, part of ``torques``, shape (n, n_joints) [N m].
         least_singular: smallest singular value of the tool's Jacobian, with 1 rad counted as 0.3 m, shape (n,) [m/rad].
     """
 

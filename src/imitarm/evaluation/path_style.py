@@ -21,9 +21,9 @@ class PathStyle:
     r"""The difference between an executed path and the mean of the demonstrations, compared as curves.
 
     Both paths are resampled at 200 points that are evenly spaced along the arc, so timing does not matter. Dynamic time
-    warping then matches the points x_i of the executed path with points m_j of the mean path. It keeps the order of the
-    points and minimises the sum of squared distances. Let P be the set of matched pairs, and let :math:`\Sigma_j` be
-    the covariance of the demonstrations at m_j. Then
+    warping then matches the points x_i of the executed path with points m_j of the mean path. This matching keeps the
+    order of the points and minimises the sum of squared distances. Let P be the set of matched pairs, and let
+    :math:`\Sigma_j` be the covariance of the demonstrations at m_j. Then
 
     .. math:: \mathrm{rmse}^2 = \frac1{|P|} \sum_{(i,j) \in P} |x_i - m_j|^2, \qquad
               \mathrm{deviation} = \max_i \min_{j: (i,j) \in P} \sqrt{(x_i - m_j)^T \Sigma_j^{-1} (x_i - m_j)}
@@ -31,7 +31,7 @@ class PathStyle:
     Attributes:
         rmse: root mean square distance of the matched points [m].
         deviation: largest Mahalanobis distance along the executed path, in standard deviations of the demonstrations.
-        tilt: largest rotation of the tool away from the rotation at the nearest point of the mean path [rad].
+        tilt: largest angle between the tool's rotation and the rotation at the nearest point of the mean path [rad].
     """
 
     rmse: float

@@ -31,16 +31,17 @@ _FOLLOWS = 0.5  # of the hand's own motion (RMS); a tool with a larger error doe
 class TargetTracking:
     """How closely the tool tracked the target that the retargeting method computed.
 
-    The tool tracked the target if three conditions hold: the robot was engaged for at least half of the time, the RMS
-    distance was at most :data:`FAR`, and the tool was farther away than :data:`FAR` for at most :data:`FAR_FRACTION` of
-    the time with a target. FAR is 5 cm: at this distance from its target, a gripper is still at the object that it
-    should grasp. The normal lag of the method ``modern`` is small enough for these conditions.
+    The tool tracked the target if three conditions hold. The robot was engaged for at least half of the time. The RMS
+    distance between tool and target was at most :data:`FAR`. The distance exceeded :data:`FAR` for at most the fraction
+    :data:`FAR_FRACTION` of the time in which there was a target. FAR is 5 cm: at this distance from its target, a
+    gripper is still at the object that it should grasp. The normal lag of the method ``modern`` is small enough for
+    these conditions.
 
     Attributes:
         title: title of the method.
         rms: root mean square distance between tool and target [m]; nan when there was no target.
         far_fraction: ``far_time`` divided by the time in which there was a target, 0 to 1; nan without a target.
-        far_time: time in which the tool was farther away than :data:`FAR` [s].
+        far_time: time in which the tool was farther than :data:`FAR` from its target [s].
         farthest: largest distance between tool and target [m]; nan without a target.
         engagements: number of times that the robot began to follow the person.
         engaged_fraction: fraction of the whole time in which the robot was engaged (following, coasting, holding), 0 to
@@ -81,7 +82,7 @@ class TargetTracking:
 
     @property
     def near(self) -> bool:
-        """Whether the tool was near its target while there was a target (the conditions with FAR and FAR_FRACTION)."""
+        """Whether the distance between tool and target satisfied the conditions with FAR and FAR_FRACTION."""
         return self.rms <= FAR and self.far_fraction <= FAR_FRACTION
 
     @property
@@ -100,7 +101,7 @@ class TargetTracking:
         return self.followed and not self.violations
 
     def verdict(self) -> str:
-        """Return the result in one line: whether and how well the tool followed, then whether limits were exceeded."""
+        """Return one line: how well the tool followed its target, and whether a joint exceeded a limit."""
         limits = f"limits are exceeded in {self.violations} frames" if self.violations else "no joint exceeds a limit"
         if not np.isfinite(self.rms):
             return f"{self.title}: followed nothing; {limits}"
@@ -123,8 +124,8 @@ class RunEvaluation:
         hand_lag: lag of the tool behind the hand [s]; nan when the tool does not follow the hand.
         link_distance: smallest distance between links that are not neighbours, measured between spheres that cover the
             links [m].
-        truth_known: whether the measures compare the robot with the true hand; otherwise, they compare the robot with
-            the hand that the camera measured.
+        truth_known: True: the measures compare the robot with the true hand. False: they compare the robot with the
+            hand that the camera measured.
         warnings: remarks for the user about this run, one sentence each.
     """
 

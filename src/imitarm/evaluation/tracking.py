@@ -84,7 +84,10 @@ class TrueArm:
         return cls(t, points[:, 0], points[:, 1], points[:, 2], matrix_to_quaternion(hands))
 
     def wrist_at(self, times: Array) -> Array:
-        """Return the wrist positions (m, 3) [m] at ``times`` (m,) [s], which are constant outside of the recording."""
+        """Return the wrist positions (m, 3) [m] at ``times`` (m,) [s].
+
+        Before and after the recording, the wrist is at rest.
+        """
         return np.column_stack([np.interp(times, self.times, column) for column in self.wrist.T])
 
 
@@ -142,8 +145,7 @@ class EngagementPeriods:
 
         Args:
             states: values of :class:`~imitarm.retarget.engagement.EngagementState` in each frame, shape (n,).
-            first_only: whether to treat all frames from the first engagement on as one engagement, as if the camera had
-                never lost the person.
+            first_only: whether to treat all frames from the start of the first engagement on as one engagement.
         """
         engaged = engaged_samples(states)
         begins = np.flatnonzero(engaged & ~np.concatenate([[False], engaged[:-1]]))
@@ -242,9 +244,9 @@ def target_lag(times: ArrayLike, tool: ArrayLike, targets: ArrayLike) -> float:
         targets: target positions, shape (n, 3) [m]; nan where there is no target.
 
     Returns:
-        The lag; nan when there is no target, the target does not move, or the tool does not follow the target. "Does
-        not follow" means that, at every lag, the tool's RMS error exceeds half of the target's RMS motion about
-        its mean.
+        The lag; nan when there is no target, the target does not move, or the tool does not follow the target. The tool
+        does not follow the target if its RMS error exceeds half of the target's RMS distance from the target's mean
+        position, at every lag.
     """
     t, p, aim = (np.asarray(values, dtype=float) for values in (times, tool, targets))
     known = np.isfinite(aim).all(axis=1)

@@ -74,8 +74,8 @@ class PartFile:
         Args:
             take: function that is called with the path ``part``. The function may create ``PATH`` from ``PATH.part``,
                 and returns whether ``PATH.part`` was renamed. If ``take`` returns False, ``PATH.part`` is removed. If
-                ``take`` returns True, no file is removed, because a file ``PATH.part`` that exists after the renaming
-                belongs to another recorder.
+                ``take`` returns True, no file is removed: a file ``PATH.part`` that exists now belongs to another
+                recorder.
             begin: text that replaces the text ``begin`` of the constructor; the two texts must have the same length.
 
         Raises:

@@ -53,7 +53,7 @@ class Table:
             brackets (``x [mm]``). The value None means that the file has no column names.
         values: the numbers, shape (n, columns). The caller must check for nan and inf.
         lines: line number of each row in the file, from 1, shape (n,).
-        ends_in_newline: False when the last line may have been cut off.
+        ends_in_newline: whether the file ends with a line break; if not, the last line may have been cut off.
         names_line: line number of the column names, from 1; None when there are no names.
         remark_lines: line number and text of each remark in the file, without the ``#``.
     """
@@ -90,7 +90,7 @@ def read_bytes(path: str | Path) -> bytes:
 
 
 def kind_of(content: bytes) -> str | None:
-    """Return the kind of a binary file, from the first bytes of its ``content``; None when they look like text."""
+    """Return the kind of a binary file, from the first bytes of ``content``; None when these bytes look like text."""
     for signature, kind in SIGNATURES.items():
         if content.startswith(signature):
             return kind

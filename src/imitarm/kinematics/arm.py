@@ -92,13 +92,14 @@ class ArmModel(ArmKinematics):
         max_velocity: largest joint speeds, shape (n_joints,) [rad/s].
         max_acceleration: largest joint accelerations, shape (n_joints,) [rad/s^2].
         max_torque: largest joint torques, shape (n_joints,) [N m]; inf where the file has no limit.
-        home: a posture to start in, shape (n_joints,) [rad].
+        home: posture in which the arm starts by default, shape (n_joints,) [rad].
         tool_to_flange: pose of the tool's tip in the flange frame; the identity without a tool.
         tool_radius: radius of the cylinder about the tool's axis that contains the tool's head [m]; 0 without a tool.
         sphere_bodies: name of the body of each sphere of :meth:`collision_spheres`.
         cover: radii and links of the spheres of :meth:`collision_spheres`.
         chain: kinematics and dynamics of the arm for arrays of postures.
-        landmarks: shoulder, elbow and wrist, from sites of these names in the file; None if the file has none.
+        landmarks: shoulder, elbow and wrist, from the sites ``shoulder``, ``elbow`` and ``wrist`` in the file; None if
+            a site is missing.
         notes: assumptions about values that the file does not define, and joints that are not part of the arm.
     """
 
@@ -212,7 +213,7 @@ class ArmModel(ArmKinematics):
         return f"ArmModel.load({str(path)!r}, tool={options['tool']!r})"
 
     def spec(self) -> mujoco.MjSpec:
-        """Return a new MuJoCo spec of the arm and its tool, from which to build a world; the base is at the origin.
+        """Return a new MuJoCo spec of the arm and its tool, for building a simulated world; the base is at the origin.
 
         Names are taken from the file; names of the tool begin with ``"tool/"``, except the site ``"tool"`` at its tip.
         The flange is the site ``"flange"``. Geoms of group 3 are used for contact, and all other geoms only for
@@ -224,7 +225,7 @@ class ArmModel(ArmKinematics):
         return self._spec.copy()
 
     def posture(self, model: mujoco.MjModel, q: ArrayLike | None = None, *, prefix: str = "") -> Array:
-        """Return the ``qpos`` of a world that contains this arm, with the arm at ``q``.
+        """Return the joint positions (MuJoCo's ``qpos``) of a world in which this arm is at ``q``.
 
         Args:
             model: a compiled world.
@@ -295,7 +296,7 @@ class ArmModel(ArmKinematics):
         return not self._mass_faults
 
     def check_dynamics(self) -> None:
-        """Check that every moving link has the mass and the inertia that are required for torques and simulation.
+        """Raise an error if a moving link lacks its mass or inertia, which torques and simulation need.
 
         Raises:
             InputError: if a link lacks its mass or inertia; the message names these links and their lines in the file.
@@ -315,7 +316,7 @@ class ArmModel(ArmKinematics):
         return self._recursive_newton_euler(q, None, None)
 
     def inverse_dynamics(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Array:
-        """Return the torques of a motion by the recursive Newton-Euler algorithm.
+        """Return the joint torques that a motion requires, by the recursive Newton-Euler algorithm.
 
         Args:
             q: joint positions, shape (n_joints,) [rad].

@@ -58,7 +58,7 @@ class ArmFile:
         home: position of every joint by name, including the joints of the tool.
         tool_radius: radius of the cylinder about the tool's axis that holds the tool's head [m]; 0 without a tool.
         notes: assumptions about values that the file does not define, and joints that were left out.
-        mass_faults: texts that name the links with an unusable mass or inertia; with such a link, torques can't be
+        mass_faults: one text for each link whose mass or inertia can't be used. With such a link, torques can't be
             computed.
     """
 
@@ -95,13 +95,14 @@ def read_arm(
     Args:
         source: ``"sawyer"``, ``"panda"`` or the path of an MJCF or URDF file.
         tool: ``"gripper"``, ``"brush"``, the path of an MJCF file with a site ``tool``, or None.
-        flange: body or site that is the flange; None: the site ``flange``, or the last link of the only arm in the
-            file.
+        flange: body or site that is the flange; None: the site ``flange``; without such a site, the last link of the
+            only arm in the file.
         discard_meshes: whether to read the file without its meshes.
         package_path: folders to search for meshes and ROS packages.
 
     Raises:
-        UnknownNameError: when the name is neither a packaged name nor a file.
+        UnknownNameError: when a name is neither a packaged arm or tool nor a file, or when the file contains no such
+            flange.
         FileFormatError: when the file can't be read as a robot.
         InputError: when the file has no joint, or the requested flange or tool can't be used.
     """
@@ -169,7 +170,7 @@ def _located(source: str | Path, packaged: Mapping[str, str], kind: str) -> Path
 
 
 def _read_part(path: Path, discard_meshes: bool, package_path: list[Path]) -> _Part:
-    """Read ``path``; fixed links of a URDF remain separate bodies, so that a flange can be found among them."""
+    """Read ``path``; links connected by fixed joints remain separate bodies, because one of them may be the flange."""
     root = read_xml(path, "an MJCF or URDF file")
     check_file(path, root)
     try:
@@ -305,7 +306,7 @@ def _touches(geom: mujoco.MjsGeom) -> bool:
 
 
 def _separate_contact_shapes(spec: mujoco.MjSpec) -> None:
-    """Put every shape with contact into group 3, and copy it into group 2 if its link has no visual shape."""
+    """Put shapes used for contact into group 3; if a link has no other shapes, add copies for drawing in group 2."""
     for body in spec.bodies:
         touching = [geom for geom in body.geoms if _touches(geom)]
         unseen = len(touching) == len(body.geoms)
@@ -362,7 +363,9 @@ def _names(spec: mujoco.MjSpec) -> list[str]:
 def _attach(spec: mujoco.MjSpec, tool: mujoco.MjSpec, path: Path) -> float:
     """Attach a tool, read from ``path``, to the flange (or to the site ``tool_mount``) and return its radius."""
     if tool.site("tool") is None:
-        raise InputError(f"{path}: a tool needs a site named 'tool' at its tip, z pointing away from the flange")
+        raise InputError(
+            f"{path}: a tool needs a site named 'tool' at its tip, whose z axis points away from the flange"
+        )
     for key in list(tool.keys):
         tool.delete(key)
     radius = tool.numeric("tool_radius")

@@ -109,7 +109,10 @@ class _HomeSearch:
         return np.linalg.svd(linear, compute_uv=False), np.linalg.svd(stacked, compute_uv=False)
 
     def score(self, q: Array) -> float:
-        """Return a score: high far from singularities and limits, and higher if the flange is above the base."""
+        """Return a score that grows with the distance from singularities and limits.
+
+        The score is halved if the flange is below the base.
+        """
         bend = self.bend(q)
         margin = float(np.min(np.minimum(q - self._low, self._high - q) / (self._high - self._low)))
         below = self._data.site_xpos[self._flange, 2] < 0.0

@@ -1,4 +1,4 @@
-"""The joints of an arm: which joints of a file belong to it, their limits, and their home position."""
+"""Find the joints in a file that belong to the arm, and read their limits and their home positions."""
 
 from __future__ import annotations
 
@@ -334,7 +334,7 @@ def _urdf_limits(joint: XmlElement, where: str) -> tuple[float, float]:
 
 
 def _limit(limit: XmlElement, key: str, where: str) -> float | None:
-    """Return one number of a ``<limit>``; None where it is not given."""
+    """Return the number in the attribute ``key`` of a ``<limit>``; None if this attribute is missing."""
     if key not in limit.attributes:
         return None
     try:
@@ -350,7 +350,7 @@ def _limit(limit: XmlElement, key: str, where: str) -> float | None:
 
 
 def _torque_limit(model: mujoco.MjModel, name: str) -> float:
-    """Return the joint's own force range, else the force range of its actuator, else inf."""
+    """Return the torque limit of a joint: from its own force range, else from its actuator, else inf."""
     joint = model.joint(name).id
     if model.jnt_actfrclimited[joint]:
         return float(np.max(np.abs(model.jnt_actfrcrange[joint])))
@@ -384,7 +384,7 @@ def _listed(names: list[str]) -> str:
 def take_keyframe(spec: mujoco.MjSpec, model: mujoco.MjModel) -> tuple[dict[str, float], str]:
     """Return the joint positions of the keyframe ``home``, else of the first keyframe, and the name of that keyframe.
 
-    Remove all keyframes.
+    The function also removes all keyframes from ``spec``.
     """
     keys = list(spec.keys)
     home: dict[str, float] = {}

@@ -71,7 +71,7 @@ class Landmarks:
 
 
 class ArmMemory:
-    """MuJoCo's working memory for one arm in one thread, and the posture for which the memory holds the kinematics.
+    """MuJoCo's working memory for one arm in one thread, with the kinematics of one posture.
 
     Attributes:
         data: MuJoCo's data, with the kinematics of the posture.
@@ -84,7 +84,7 @@ class ArmMemory:
             posture.
         posture: the joint positions as bytes.
         n_joints: number of the arm's joints.
-        kept: arrays that compiled code uses again in every step, by the name of their purpose.
+        kept: arrays that compiled code reuses in every step, by name.
     """
 
     def __init__(
@@ -339,7 +339,8 @@ def find_posture(
     Args:
         arm: the arm.
         pose: desired pose in the base frame.
-        q0: posture from which to start and near which to stay, shape (n_joints,) [rad]; None: ``home``.
+        q0: posture from which the search starts, and near which the result should be, shape (n_joints,) [rad]; None:
+            ``home``.
         frame: frame to bring to this pose, ``"tool"`` or ``"flange"``.
         restarts: number of random start postures.
         seed: seed of the random postures.

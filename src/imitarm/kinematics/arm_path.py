@@ -39,7 +39,7 @@ class ArmPath:
         joints: joint positions, shape (n, n_joints) [rad].
         positions: positions of the tool's tip in the base frame, shape (n, 3) [m].
         quaternions: rotations tool_to_base, wxyz, shape (n, 4).
-        placed: the joints and links (``JointChain.placed``).
+        placed: positions and rotations of the joints and links, from ``JointChain.placed``.
     """
 
     arm: ArmModel
@@ -106,10 +106,11 @@ class ArmPath:
     def travel(self) -> Array:
         """Upper bounds of the path length of each link's spheres from one posture to the next.
 
-        The joints move linearly. Between the two postures, a sphere may be farther from a joint's axis than in either
-        posture. The additional distance is at most half of the path that the joints between axis and sphere cause.
+        Between two postures, each joint moves at constant speed. Between the two postures, a sphere may be farther from
+        a joint's axis than in either posture. The additional distance is at most half of the path that the joints
+        between axis and sphere cause.
 
-        The shape is (n - 1, n_joints, n_joints) [m]; the axes mean what they mean in :meth:`speeds`.
+        The shape is (n - 1, n_joints, n_joints) [m]; :meth:`speeds` describes the second and the third axis.
         """
         steps = np.abs(np.diff(self.joints, axis=0))
         travel = np.maximum(self._reaches[:-1], self._reaches[1:])
@@ -169,7 +170,7 @@ class ArmPath:
         return np.concatenate([positions - self.positions, rotation], axis=1)
 
     def moved_to(self, positions: Array, quaternions: Array) -> tuple[ArmPath, float]:
-        """Move the joints of all postures so that the tool reaches given poses, with the least joint motion (Newton).
+        """Change each posture as little as possible so that the tool reaches a given pose (Newton's method).
 
         Args:
             positions: positions of the tool's tip, shape (n, 3) [m].
@@ -190,7 +191,7 @@ class ArmPath:
 
 
 def right_inverses(jacobians: Array) -> Array:
-    """Return damped right inverses (n, n_joints, 6) of Jacobians (n, 6, n_joints)."""
+    """Return damped right inverses (n, n_joints, 6) of Jacobians (n, 6, n_joints), with weighted rotations."""
     weighted = _WEIGHTS[:, None] * jacobians
     transposed = np.swapaxes(weighted, 1, 2)
     squares = weighted @ transposed + _DAMPING**2 * np.eye(6)

@@ -131,7 +131,8 @@ class IKSolver:
             rows: additional inequalities in this step, only for ``"qp"``.
 
         Raises:
-            InputError: when a shape is wrong, a number is not finite, or the method does not take such tasks or rows.
+            InputError: when a shape is wrong, a number is not finite, or the method does not accept these tasks or
+                rows.
         """
         return self._solve(self.problem(q, tasks, velocity, rows))
 
@@ -143,7 +144,7 @@ class IKSolver:
         velocity: ArrayLike | None = None,
         rows: Rows | Sequence[Rows] | None = None,
     ) -> IKStep:
-        """Solve like :meth:`solve`, with the same arguments and errors, and also report unmet tasks and limits."""
+        """Solve like :meth:`solve`, with the same arguments and errors, and also return the remaining errors."""
         problem = self.problem(q, tasks, velocity=velocity, rows=rows)
         result = self._solve(problem)
         counted = result / self.arm.max_velocity if self._scaled else result
@@ -276,7 +277,8 @@ def solve_ik(
 
     Raises:
         UnknownNameError: when the method is not known.
-        InputError: when a shape is wrong, a number is not finite, or the method does not take such tasks or limits.
+        InputError: when a shape is wrong, a number is not finite, or the method does not accept these tasks, limits or
+            rows.
     """
     try:
         solver = _solver(arm, dt, method) if limits is None else IKSolver(arm, limits, dt=dt, method=method)
@@ -316,7 +318,7 @@ def quadratic_program(problem: IKProblem) -> Array:
 
 
 def _stacked(tasks: list[TaskRows]) -> tuple[Array, Array]:
-    """Return the stacked targets of all tasks; filling an array takes half as long as concatenating."""
+    """Return the stacked Jacobians and targets of all tasks; filling an array is twice as fast as concatenating."""
     end, (m, n) = 0, tasks[0].jacobian.shape
     for part in tasks[1:]:
         m += len(part.target)
@@ -328,7 +330,7 @@ def _stacked(tasks: list[TaskRows]) -> tuple[Array, Array]:
 
 
 def _sorted_rows(rows: list[Rows]) -> tuple[Array | None, Array | None, Sequence[Rows]]:
-    """Return matrix and bounds of all rows without a finite price, and separately the rows with a finite price."""
+    """Return the matrix and the bounds of all hard rows (infinite price), and the list of rows with a finite price."""
     if len(rows) == 1 and rows[0].price == math.inf:
         return rows[0].matrix, rows[0].lower, ()
     stiff = [part for part in rows if part.price == math.inf]
@@ -390,7 +392,7 @@ def _scaled_eye(n: int, factor: float) -> Array:
 
 
 def _plain(n: int) -> NDArray[np.intc]:
-    """Return daqp's flags for plain inequalities; daqp writes into this array."""
+    """Return flags for n plain inequalities, for the solver daqp; daqp writes into this array."""
     return np.zeros(n, dtype=np.intc)
 
 

@@ -79,14 +79,13 @@ class IKProblem:
         velocity: joint velocity of the previous step, shape (n_joints,) [rad/s]; None: unknown, so accelerations are
             not limited.
         dt: length of the control step [s].
-        box: hard bounds of the joint velocity. They begin as the arm's velocity limits; each limit of the solver may
-            narrow them.
+        box: hard bounds of the joint velocity: the arm's velocity limits, narrowed by the limits of the solver.
         tasks: rows of the tasks; the tool's rows come first.
         rows: soft inequalities.
         max_speed: largest norm of a twist, for tasks without their own limit [m/s].
         scaled: whether each joint velocity is counted in units of its velocity limit, as in damped least squares.
-        posture: desired joint velocity in the null space of the tool's task, shape (n_joints,) [rad/s], for the damped
-            methods; None: no such velocity.
+        posture: desired joint velocity in the null space of the tool's task, shape (n_joints,) [rad/s]; only the damped
+            methods use it. None: no null-space motion is desired.
     """
 
     arm: ArmModel
@@ -103,5 +102,5 @@ class IKProblem:
 
     @property
     def moving(self) -> bool:
-        """Whether the tool's task has a nonzero target; True as long as the target is unknown."""
+        """Whether the tool's task has a nonzero target; True until a task has been added."""
         return not self.tasks or bool(self.tasks[0].target.any())

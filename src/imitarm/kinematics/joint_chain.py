@@ -82,7 +82,7 @@ class JointChain:
         self._bodies(model, data, cover)
 
     def _bodies(self, model: mujoco.MjModel, data: mujoco.MjData, cover: SphereCover) -> None:
-        """Add up mass, first moment and inertia about the base's origin of what each joint moves, but no later one."""
+        """Add up the mass, first moment and inertia of each link's bodies, about the origin of the base."""
         n = len(self._reference)
         self._mass, self._moment, self._inertia = np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3, 3))
         carriers = cover.carriers.tolist()
@@ -220,7 +220,7 @@ def _shifted(moments: Array, shifts: Array) -> Array:
 
 
 def _slice(index: NDArray[np.intp]) -> slice | NDArray[np.intp]:
-    """Return a slice instead of an index array where the indices are consecutive."""
+    """Return consecutive indices as a slice; return other indices unchanged."""
     if index[-1] - index[0] + 1 == len(index):
         return slice(int(index[0]), int(index[-1]) + 1)
     return index

@@ -26,11 +26,12 @@ def least_violation(box: Box, matrix: Array, least: Array, floor: Array | None =
         box: bounds of each joint velocity.
         matrix: coefficients of the rows, shape (m, n_joints).
         least: lower bounds of the rows, shape (m,).
-        floor: lower bounds that are kept in any case, shape (m,); some velocity in the box must keep them all. None:
-            no such bounds.
+        floor: hard lower bounds of the rows, shape (m,); at least one velocity in the box must satisfy all of them.
+            None: no hard bounds.
 
     Returns:
-        The velocity v, shape (n_joints,) [rad/s]. Among several solutions, it is the velocity with the smallest norm.
+        The velocity v, shape (n_joints,) [rad/s]. If several velocities are optimal, v is the one with the smallest
+        norm.
     """
     n = matrix.shape[1]
     middle, half = 0.5 * (box.upper + box.lower), 0.5 * (box.upper - box.lower)

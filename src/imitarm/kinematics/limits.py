@@ -44,7 +44,9 @@ class Limit(ABC):
 
 
 class JointLimits(Limit):
-    r"""Position, velocity and acceleration limits of the joints, combined to a box that is never empty.
+    r"""Position, velocity and acceleration limits of the joints, combined into a box of joint velocities.
+
+    The box contains a lower and an upper bound of each joint velocity, and is never empty.
 
     Let D be the distance to the upper position limit [rad], a the acceleration limit [rad/s^2] and :math:`dt` the
     length of a control step [s]. A joint can stop before the position limit only if its velocity is at most
@@ -54,14 +56,15 @@ class JointLimits(Limit):
 
     The velocity :math:`v_b` is the solution of :math:`v^2/(2a) + v\,dt = D`. The upper bound is
     :math:`\min(v_{max},\; v_p + a\,dt,\; \max(v_b(D),\, v_p - a\,dt))` where :math:`v_p` is the previous velocity; the
-    lower bound is its mirror image. If :math:`v_p` satisfied this bound in the previous step, braking with the
-    acceleration a satisfies the bound in this step. The box is therefore never empty.
+    lower bound has the same form, with the lower position limit and opposite signs. If :math:`v_p` satisfied this bound
+    in the previous step, braking with the acceleration a satisfies the bound in this step. The box is therefore never
+    empty.
 
     The bound assumes that the joint moves by :math:`v\,dt` in one step. A robot with constant acceleration moves by
     :math:`(v_p + v)\,dt/2`; ``imitarm.robots.limit_velocity`` therefore evaluates this box at :math:`q + v_p\,dt/2`.
 
     Args:
-        arm: whose limits.
+        arm: arm whose limits are kept.
     """
 
     def __init__(self, arm: ArmModel) -> None:
@@ -76,7 +79,7 @@ class JointLimits(Limit):
         return known.at(problem.q, problem.velocity)
 
     def box(self, q: Array, dt: float, velocity: Array | None = None) -> Box:
-        """Return the bounds at one posture; the arrays must not be changed.
+        """Return the bounds at one posture; the caller must not change the arrays.
 
         Args:
             q: joint positions, shape (n_joints,) [rad].
@@ -186,8 +189,8 @@ class WristSingularityLimit(Limit):
     The wrist is singular at every multiple of pi, because the joint axes before and after the wrist joint are parallel
     there. Let e be the joint's distance from the nearest multiple of pi [rad], and :math:`e'` the rate at which e grows
     [rad/s]. If e exceeds 0.1, the limit is :math:`e' \ge -v_b(e - 0.1)` (see :class:`JointLimits`). If e is at most
-    0.1, the limit is :math:`e' \ge 5\,(0.1 - e)`. The price of a violation is low, so that the wrist can rotate through
-    a singular position if necessary.
+    0.1, the limit is :math:`e' \ge 5\,(0.1 - e)`. The penalty weight (price) of a violation is low, so that the wrist
+    can pass through a singular position if necessary.
 
     Args:
         arm: the arm; its file must mark shoulder, elbow and wrist.

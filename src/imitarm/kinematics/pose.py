@@ -1,8 +1,8 @@
-"""Positions and rotations: quaternions (w, x, y, z) as arrays, and the typed :class:`Pose`.
+"""Positions and rotations: quaternions (w, x, y, z) as arrays, and the class :class:`Pose`.
 
-All functions take and return arrays with any leading shape and are vectorised over it. The functions do not check their
-arguments; :class:`Pose` does. A single rotation is computed with plain floats, because a control step computes many
-rotations and floats are faster than a numpy array of four numbers.
+All functions accept arrays with any number of leading dimensions, and process all their elements at once. The functions
+do not check their arguments, but :class:`Pose` checks them. A single rotation is computed with plain floats, because a
+control step computes many rotations and floats are faster than a numpy array of four numbers.
 
 Rotation vectors (axis times angle) are in rad. Twists have shape (6,): linear velocity [m/s] first, then angular
 velocity [rad/s], both in the base frame.
@@ -148,7 +148,7 @@ def rotate(q: ArrayLike, vectors: ArrayLike) -> Array:
 
 
 def continuous_signs(quaternions: ArrayLike) -> Array:
-    """Flip the signs of quaternions so that no quaternion is followed by nearly its negative.
+    """Flip the signs of quaternions so that each quaternion is nearer to the previous one than its negative is.
 
     Args:
         quaternions: unit quaternions wxyz in time order, shape (n, 4).
@@ -162,10 +162,11 @@ def continuous_signs(quaternions: ArrayLike) -> Array:
 
 
 def slerp(times: ArrayLike, key_times: ArrayLike, key_quaternions: ArrayLike) -> Array:
-    """Interpolate rotations along the shortest arc between neighbouring keys.
+    """Interpolate between successive key rotations along the shortest arc.
 
     Args:
-        times: query times [s], shape (n,); outside the keys the first or last rotation is held.
+        times: query times [s], shape (n,). Before the first key the rotation is that of the first key, after the last
+            key that of the last.
         key_times: strictly increasing times [s], shape (k,).
         key_quaternions: unit quaternions wxyz, shape (k, 4).
 
@@ -309,12 +310,12 @@ class Pose:
         return Pose(self.position + rotate(self.quaternion, other.position), q)
 
     def apply(self, points: ArrayLike) -> Array:
-        """Map ``points`` (..., 3) [m] through this pose."""
+        """Transform ``points``, shape (..., 3) [m], with this pose: ``R p + position``."""
         given = finite_array(points, (..., 3), "points", "m")
         return np.asarray(given @ self.rotation.T + self.position)
 
     def error_to(self, target: Pose) -> Array:
-        r"""Return the translation and rotation from this pose to ``target``, in the reference frame of both, (6,).
+        r"""Return the translation and rotation from this pose to ``target``, in their common reference frame, (6,).
 
         The linear part is :math:`p_{target} - p` [m], the angular part :math:`\log(R_{target} R^T)` [rad] (Lynch and
         Park, Modern Robotics, 2017, section 3.2.3).

@@ -1,11 +1,11 @@
 r"""The shoulder-elbow-wrist angle: the position of the elbow on its circle about the line from shoulder to wrist.
 
 The elbow of an arm with seven joints can move while the hand is at rest. One angle describes the elbow's position, both
-for a person and for a robot. This angle is measured from a reference direction, and for every choice of that direction
-there are wrist positions at which the angle is undefined (Elias and Wen 2024). The ``"conventional"`` angle, measured
-from a fixed vector v, is undefined when the wrist is on the line through the shoulder along v. The ``"stereographic"``
-angle is undefined only when the wrist is on one half of a line through the shoulder. This half-line can be placed where
-the wrist never is; in this module it points backwards, behind the base.
+for a person and for a robot. This angle is measured from a reference direction. For every choice of the reference
+direction, the angle is undefined at some wrist positions (Elias and Wen 2024). The ``"conventional"`` angle is measured
+from a fixed vector v. It is undefined when the line from shoulder to wrist is parallel to v. The ``"stereographic"``
+angle is undefined only when the wrist is on one half of a line through the shoulder. In this module, this half-line
+points backwards from the shoulder, where the wrist rarely is.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class SewAngle(NamedTuple):
     """The SEW angle of one or more arms, and its derivatives.
 
     Attributes:
-        angle: SEW angle in (-pi, pi], shape (...) [rad].
+        angle: SEW angle in [-pi, pi], shape (...) [rad].
         shoulder: derivative with respect to the shoulder's position, shape (..., 3) [rad/m].
         elbow: derivative with respect to the elbow's position, shape (..., 3) [rad/m].
         wrist: derivative with respect to the wrist's position, shape (..., 3) [rad/m].
@@ -100,7 +100,7 @@ def sew_derivatives(
 
 
 def sew_jacobian(points: Array, jacobians: Array, *, convention: str = "stereographic") -> tuple[float, Array]:
-    """Return the angle of an arm in one posture and its Jacobian.
+    """Return the SEW angle of an arm in one posture, and the Jacobian of this angle.
 
     Args:
         points: positions of shoulder, elbow and wrist, shape (3, 3) [m], for example from ``ArmModel.sew_points``.
@@ -197,7 +197,7 @@ CONVENTIONS: dict[str, Callable[[Any, Vector, Vector], SewAngle]] = {
     "conventional": _conventional,
     "stereographic": _stereographic,
 }
-"""Choices of the direction from which the angle is measured."""
+"""Functions that compute the SEW angle, by the name of the convention."""
 
 
 def _formula(convention: str) -> Callable[[Any, Vector, Vector], SewAngle]:

@@ -26,7 +26,7 @@ class SphereCover:
     Attributes:
         bodies: name of the body that carries each sphere.
         radii: radii of the spheres, shape (m,) [m].
-        links: number of the arm's joints that move each sphere, shape (m,).
+        links: number of joints between the base and each sphere, shape (m,).
         follows_last_joint: True for each sphere that moves rigidly with the flange, shape (m,).
         base_centers: centers of the spheres that cover the base, which never moves, shape (b, 3) [m].
         base_radii: radii of the base's spheres, shape (b,) [m].
@@ -110,7 +110,7 @@ class SphereCover:
         return np.asarray(turned[..., 0] + origins[:, self.owners])
 
     def speeds(self, data: mujoco.MjData, spheres: NDArray[np.int_], centers: Array, normals: Array) -> Array:
-        """Return how fast each joint moves chosen spheres along chosen directions, shape (k, n_joints) [m/rad].
+        """Return the speed of spheres along given directions per unit of joint speed, shape (k, n_joints) [m/rad].
 
         MuJoCo stores the twist ``(w, v)`` of each joint about the centre of mass ``o``. This twist moves a point ``c``
         along ``n`` at the rate ``n.(v + w x (c - o)) = n.v + w.((c - o) x n)``.
@@ -190,8 +190,8 @@ def _carries(model: mujoco.MjModel, carrier: int, body: int) -> bool:
 def covering_spheres(model: mujoco.MjModel, geom: int) -> tuple[Array, float]:
     """Cover one geom with equal spheres: every point of the geom is inside at least one sphere.
 
-    Round bars (capsule, cylinder, ellipsoid) are covered by a row of spheres, all other shapes (box, bounding box of a
-    mesh) by a grid of spheres.
+    A row of spheres covers a capsule, a cylinder or an ellipsoid. A grid of spheres covers any other shape, for example
+    a box or the bounding box of a mesh.
 
     Args:
         model: the compiled model.
@@ -222,7 +222,7 @@ def covering_spheres(model: mujoco.MjModel, geom: int) -> tuple[Array, float]:
 
 
 def _pieces(half_length: float, radius: float) -> int:
-    """Return the number of spheres that cover a round bar; the number is limited, so a thin wire gets larger ones."""
+    """Return the number of spheres that cover a round bar; the number is limited, so a wire gets larger spheres."""
     return max(1, math.ceil(min(2.0 * half_length / (_SPACING * radius), _MOST_PIECES)))
 
 
