@@ -34,8 +34,8 @@ class Command:
 
     Attributes:
         twist: twist of the tool in the base frame, linear velocity first, shape (6,) [m/s, rad/s].
-        joint_velocity: velocity of the joints, shape (n_joints,) [rad/s]; if given, it replaces the twist, for example
-            along a planned joint path. None: the inverse kinematics computes the joint velocity from the twist.
+        joint_velocity: velocity of the joints, shape (n_joints,) [rad/s]; if given, the robot follows it instead of the
+            twist. None: the inverse kinematics computes the joint velocity from the twist.
         posture: joint positions towards which the arm drifts in the null space of the twist, shape (n_joints,) [rad].
             With None, the arm has no preferred position.
         elbow: SEW (shoulder-elbow-wrist) angle to which the elbow rotates in the null space of the twist [rad]; None:

@@ -42,7 +42,7 @@ class UnknownNameError(InputError):
 
 
 class TaskFailedError(ImitarmError):
-    """The input was understood, but the task can't be done or was not done (exit status 1)."""
+    """The input is valid, but the task failed (exit status 1)."""
 
     exit_status = 1
 

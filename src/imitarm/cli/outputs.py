@@ -24,7 +24,7 @@ def check_outputs(
     """Reject outputs that would overwrite an input, another output or an existing file.
 
     Args:
-        outputs: option and file of each output; if the file is None, the output is not written.
+        outputs: for each output, its option and its file; None instead of the file if this output is not written.
         inputs: for each input, the name of the option or argument, and its value: a file or the name of a source.
         force: whether existing files may be replaced; None if the command has no option ``--force``.
         new_folders: whether the command creates missing folders.
@@ -53,7 +53,7 @@ def check_outputs(
 
 
 def same_place(one: Path, other: Path) -> bool:
-    """Return whether two paths denote the same file or folder, even if it does not exist yet."""
+    """Return whether two paths denote the same file or folder, which need not exist yet."""
     if one.exists() and other.exists():
         return one.samefile(other)
     return _place(one) == _place(other)

@@ -1,4 +1,4 @@
-"""Arguments, reading and printing of issues, for all commands that read a person's motion from a source."""
+"""For commands that read a person's motion: add the arguments, read the motion, and print issues."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def add_source(parser: argparse.ArgumentParser, name: str = "source", purpose: s
 
 def add_side_and_person(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose an arm and a person."""
-    parser.add_argument("--side", choices=SIDES, default="right", help="the person's arm; default: right")
+    parser.add_argument("--side", choices=SIDES, default="right", help="arm of the person; default: right")
     parser.add_argument(
         "--person",
         type=int,
@@ -133,15 +133,15 @@ def gather(
 def person_of(arguments: argparse.Namespace, side: str) -> tuple[list[Skeleton], list[str], Truth | None]:
     """Read the person from the source, according to the options ``person``, ``seconds``, ``trim`` and ``pace``.
 
-    A recording is repaired first. Changes and issues are printed.
+    If the source is a recording, the function first repairs it. The function prints the repairs and the issues.
 
     Args:
         arguments: arguments of the command.
         side: which of the person's arms the robot follows, ``"left"`` or ``"right"``.
 
     Returns:
-        The skeletons; the changes and issues, one sentence each; and the person's true motion, or None if the source is
-        not synthetic.
+        The skeletons, then one sentence for each repair and each issue, then the person's true motion (None if the
+        source is not synthetic).
 
     Raises:
         InputError: when the source or an option is wrong.

@@ -67,7 +67,7 @@ def read_and_lint(
 
     Args:
         arguments: arguments added by :func:`add_reading_arguments`.
-        arm: robot arm with which the demonstrations were recorded.
+        arm: robot arm with which the demonstrations were recorded; None: checks against an arm are left out.
         task: name of the task.
         repair: whether to drop invalid rows before the checks.
 

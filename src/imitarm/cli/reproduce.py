@@ -52,7 +52,7 @@ FORBIDDEN = {"keep_height": HORIZONTAL_ONLY, "not_down": NOT_DOWN}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.add_argument("skill", metavar="SKILL", type=Path, help="a skill file, as 'imitarm learn' writes it")
+    parser.add_argument("skill", metavar="SKILL", type=Path, help="skill file, written by 'imitarm learn'")
     add_robot_options(parser)
     parser.add_argument(
         "--scene", type=Path, metavar="FILE", help="file of obstacles and goal (YAML); default: no obstacles"
@@ -97,25 +97,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--tool-radius",
         type=float,
         metavar="MM",
-        help="radius of a sphere about the tip that replaces the shape of the tool",
+        help="use a sphere of this radius about the tool's tip instead of the tool's shape",
     )
     avoid.add_argument(
         "--tool-only",
         action="store_true",
-        help="keep the clearance only for the tool, not for the links of the arm (for comparison)",
+        help="keep the clearance only for the tool, not for the links of the arm; for comparisons only",
     )
     avoid.add_argument(
         "--max-tilt",
         type=float,
         metavar="DEG",
-        help="largest rotation of the tool away from the learned one, to make room for the arm; default: two standard "
-        "deviations of the demonstrated rotation",
+        help="largest angle by which the tool is rotated away from the learned rotation, to make room for the arm; "
+        "default: two standard deviations of the demonstrated rotation",
     )
     avoid.add_argument(
         "--goal-tilt",
         type=float,
         metavar="DEG",
-        help="largest rotation of the tool away from the learned one at the goal; the tool is rotated there only if "
+        help="the same angle at the goal; the tool is rotated there only if "
         "the arm would otherwise be too close to an obstacle; default: 0",
     )
     held = avoid.add_mutually_exclusive_group()
@@ -213,7 +213,7 @@ def _observer(
         if np.linalg.norm(middle - eye) < _NEAREST_CAMERA:
             raise InputError(
                 f"--camera: {1e2 * np.linalg.norm(middle - eye):.0f} cm from the learned path is too near; the camera "
-                f"measures depths from 50 cm, so keep {1e2 * _NEAREST_CAMERA:.0f} cm"
+                f"measures only depths above 50 cm, so place it at least {1e2 * _NEAREST_CAMERA:.0f} cm away"
             )
         workspace = (path.min(axis=0) - _AROUND, path.max(axis=0) + _AROUND)
         surfaces, goal = scene.fixtures, scene.goal

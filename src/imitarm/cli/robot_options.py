@@ -45,7 +45,7 @@ def add_robot_options(parser: argparse.ArgumentParser, *, default: str | None = 
 
 
 def load_robot(arguments: argparse.Namespace) -> ArmModel:
-    """Load the arm that the options select, and print the assumptions made about it.
+    """Load the arm that the options select, and print the assumptions about values that its file does not define.
 
     Raises:
         InputError: if another option needs a robot but none is named, or the robot can't be loaded.
@@ -80,5 +80,5 @@ def load_optional_robot(arguments: argparse.Namespace) -> ArmModel | None:
 
 
 def robot_files(arguments: argparse.Namespace) -> list[tuple[str, str | None]]:
-    """Return the options that may name an input file, with their values; no output may overwrite such a file."""
+    """Return the options that may name an input file, with their values, so that no output overwrites this file."""
     return [("--robot", arguments.robot), ("--tool", arguments.tool)]

@@ -31,7 +31,7 @@ examples:
 
 Control the robot with 'imitarm teleoperate SOURCE --to 127.0.0.1:7500'.
 The robot stays stopped until the user of 'imitarm teleoperate' enables it.
-After 0.1 s without a command the robot brakes, and after 0.5 s it stays stopped until it is enabled again.
+After 0.1 s without a command, the robot brakes. After 0.5 s, the user must enable the robot again.
 Anyone who can reach the port can move the robot. Without --host, only this machine can reach the port.
 Ctrl-C brakes the robot and ends the command.
 """
@@ -152,8 +152,8 @@ class Trace:
 
     Each line is written immediately, so that no line is lost if the process is killed.
 
-    Columns: time [s], status (0 stopped, 1 following, 2 slowing, 3 fault), then set-point [rad], its velocity [rad/s]
-    and measured position [rad] of each joint.
+    The first columns are the time [s] and the status (0 stopped, 1 following, 2 slowing, 3 fault). Three columns for
+    each joint follow: set-point [rad], velocity of the set-point [rad/s] and measured position [rad].
 
     Args:
         path: file to write.

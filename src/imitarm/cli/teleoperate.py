@@ -44,7 +44,7 @@ examples:
   imitarm teleoperate udp:7400 --calibration mine.json --to 127.0.0.1:7500
   imitarm teleoperate wave.csv --side left --robot panda --latency latency.csv
 
-By default, the robot is simulated in this process. With --to, it is a robot of 'imitarm serve'.
+By default, the robot is simulated in this process. With --to, the robot is one of 'imitarm serve'.
 A robot of 'imitarm serve' is stopped at first, and moves only after you press Enter here.
 With --enable, the robot is enabled once at the start, without asking.
 The robot begins to follow a person who has been seen for half a second.

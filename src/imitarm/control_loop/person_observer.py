@@ -29,8 +29,8 @@ class PersonObserver:
 
     Args:
         skeletons: skeletons in the order of their times: a :class:`~imitarm.capture.skeleton.SkeletonSource` or any
-            other iterable. Each call reads up to the first skeleton that has not yet arrived.
-        capsules: object that converts skeletons to detected capsules.
+            other iterable. Each call of ``observe(t)`` reads skeletons until it finds one that has not yet arrived.
+        capsules: object that converts each skeleton to capsules that enclose the person's arms.
         tracker: :class:`~imitarm.perception.ObstacleTracker` that no other observer uses; None: a new tracker with
             :data:`PERSON_NOISE`.
         latency: time from the exposure to the arrival of a skeleton [s].
@@ -97,8 +97,8 @@ class CombinedObserver:
     """Combines several observers, for example a depth camera for objects and a skeleton camera for people.
 
     The scene contains the obstacles of all observers. The stamp of the scene is the oldest stamp of all observers, so
-    that a watchdog notices even a single frozen camera. Each track gets a unique number: track ``id`` of observer ``i``
-    of ``n`` becomes ``n * id + i``.
+    that a watchdog notices even a single frozen camera. With n observers, track ``id`` of observer ``i`` gets the
+    unique number ``n * id + i``.
 
     Args:
         observers: functions ``observe(t)``; the first function determines the goal and the fixtures of the scene.

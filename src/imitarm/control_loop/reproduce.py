@@ -80,12 +80,12 @@ def reproduce(
         timeout: longest duration [s].
         safety: safety filter; None: a filter that keeps the arm within its joint limits, its links at least 10 mm apart
             and the whole arm out of contact with obstacles. The filter's ``dt`` must equal this ``dt``.
-        watchdog: slows the arm down and stops it while no new scenes arrive; None: a
+        watchdog: object that slows the arm down and stops it while no new scenes arrive; None: a
             :class:`~imitarm.control_loop.watchdog.Watchdog` with its default times.
         contact: detector of contacts. True: a :class:`~imitarm.control_loop.contact.ContactDetector` with its default
             thresholds, if the masses of the arm are known. False: contacts are not detected.
-        on_step: function called after each step, for progress or drawing; if the function raises an exception, the
-            robot is stopped and the exception is raised again.
+        on_step: function called after each step, for progress or drawing; an exception in this function stops the
+            robot, and is then passed on to the caller.
 
     Returns:
         The measured motion from rest to rest. Its attribute ``success`` means that the motion finished in time, touched
@@ -96,8 +96,8 @@ def reproduce(
         :class:`~imitarm.control_loop.interventions.Intervention`, which name the parts that came close to each other.
         ``"contact"`` is the detected :class:`~imitarm.control_loop.contact.Contact`, or None. ``"statuses"`` contains
         the number of steps with each status of the policy. The details also contain the entries of the robot's
-        :meth:`~imitarm.robots.robot.Robot.report`. The attribute ``reason`` names contacts and what the safety filter
-        did.
+        :meth:`~imitarm.robots.robot.Robot.report`. The attribute ``reason`` describes contacts and interventions of the
+        safety filter.
 
     Raises:
         InputError: when ``dt`` or ``timeout`` is not positive, or the policy does not return a Command.

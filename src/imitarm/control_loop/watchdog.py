@@ -26,8 +26,7 @@ class Watchdog:
         slow_after: a_slow, age of the newest scene at which the arm begins to slow down [s]. Choose at least twice the
             time between two scenes.
         stop_after: a_stop, age of the newest scene at which the arm has stopped [s].
-        from_start: whether new scenes are expected from the start, so that the arm also stops if the first scene stays
-            the only one.
+        from_start: whether the arm also stops if no second scene arrives after the first one.
 
     Raises:
         InputError: when the times are not positive, or ``stop_after`` is not later than ``slow_after``.

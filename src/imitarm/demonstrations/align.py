@@ -205,12 +205,11 @@ def turns(quaternions: Array) -> Array:
 def moving_rows(times: Array, positions: Array, quaternions: Array | None = None) -> tuple[int, int] | None:
     """Return the first and the last row between which the tool moves; None if it never moves.
 
-    The first row is found in two steps: find the row at which the tool is first more than 0.5 mm away from its start,
-    then go back to the last row that is within 0.1 mm of the start. The last row is found in the same way, from the end
-    backwards. A margin of 0.1 s is kept on both sides. Speed is not used, so a slow motion is never mistaken for rest.
-    If the samples are noisy, both limits (0.5 mm and 0.1 mm) are raised to at least 4 standard deviations of the noise
-    that remains after averaging.
-    Rotation without displacement counts as motion.
+    The function first searches for the first row that is more than 0.5 mm away from the start. From there, it goes back
+    to the last row within 0.1 mm of the start. That row is the first row of the motion. The last row is found in the
+    same way, from the end backwards. A margin of 0.1 s is kept on both sides. Speed is not used, so a slow motion is
+    never mistaken for rest. If the samples are noisy, both limits (0.5 mm and 0.1 mm) are raised to at least 4 standard
+    deviations of the noise that remains after averaging. Rotation without displacement counts as motion.
 
     Args:
         times: strictly increasing, shape (n,) [s].
@@ -369,8 +368,8 @@ def identity_warps(n_demonstrations: int, n: int) -> Array:
 def features(trajectories: Sequence[Trajectory]) -> Array:
     """Return the features by which motions are compared [m].
 
-    Each path is first moved to the common start and goal, because a different start position does not mean that the
-    motion started earlier or later. Rotations become rotation vectors relative to the mean rotation, multiplied by a
+    Each path is first moved to the common start and goal. Otherwise, alignment would mistake a different start position
+    for an earlier or later start. Rotations become rotation vectors relative to the mean rotation, multiplied by a
     lever arm of 0.1 m. The features have the shape (n_demonstrations, n, 3), or (n_demonstrations, n, 6) with
     rotations.
     """

@@ -41,8 +41,8 @@ class Finding:
     """One fault that ``lint`` found in demonstrations, or one useful fact about them.
 
     Attributes:
-        severity: ``"error"`` (no good skill can be learned), ``"warning"`` (should be checked) or ``"note"``
-            (information).
+        severity: ``"error"``: no good skill can be learned; ``"warning"``: a user should check the demonstration;
+            ``"note"``: information that requires no action.
         code: short name that does not change between versions, such as ``"gap"``.
         message: description of the fault or fact, with measured values.
         source: name of the demonstration concerned; empty when the finding concerns all demonstrations.
@@ -88,8 +88,7 @@ class RawDemonstration:
         task: name of the task.
         lines: line number of each sample in the text file, from 1, shape (n,); None when the file is not text.
         notes: remarks of the reader about its assumptions, and about data of the file that it left out.
-        unread_rotation: names of columns that seem to hold a rotation in a form that can't be read, such as Euler
-            angles.
+        unread_rotation: names of columns that seem to contain a rotation in an unsupported form, such as Euler angles.
         length_unit: unit of the lengths in the file, from which ``positions`` were converted.
         time_unit: unit of the times in the file, from which ``times`` were converted.
         units_in_file: quantities whose units the file itself states: ``"length"``, ``"time"``, both or neither.
@@ -123,7 +122,9 @@ class RawDemonstration:
                 object.__setattr__(self, name, real_array(getattr(self, name), (n, columns), f"{what}: {name}"))
         n_joints = 0 if self.joints is None else self.joints.shape[1]
         if len(self.joint_names) != n_joints:
-            raise InputError(f"{what}: {n_joints} columns of joints need as many joint_names, got {self.joint_names}")
+            raise InputError(
+                f"{what}: {n_joints} columns of joints need {n_joints} joint_names, got {len(self.joint_names)}"
+            )
 
     @classmethod
     def of(cls, demonstration: Demonstration | RawDemonstration) -> RawDemonstration:
@@ -219,12 +220,12 @@ class RawDemonstration:
         return np.asarray(np.isfinite(self.times) & (self.times <= before))
 
     def held(self) -> NDArray[np.bool_]:
-        """Return for each row whether the sensor had no new value yet, so that the row repeats the previous row.
+        """Return for each row whether it only repeats the previous row because the sensor had no new value, shape (n,).
 
         A recorder that runs faster than its sensor repeats each value (sample and hold). A tool at rest also repeats
         values, and rounding can make different values equal. Repetitions caused by rest or rounding do not count.
         Values count as held only if they are repeated many times during the motion, and if their changes are larger
-        than rounding to the last digit would cause. The result has the shape (n,).
+        than rounding to the last digit would cause.
         """
         masks = [held_rows(part) for part in (self.positions, self.quaternions, self.joints) if part is not None]
         return max(masks, key=lambda mask: int(mask.sum()), default=np.zeros(len(self), dtype=bool))
@@ -250,8 +251,8 @@ class RawDemonstration:
 
         Args:
             arm: arm that was recorded; needed when only joints were recorded.
-            repair: whether to drop the rows that contain a number that is not finite, and the rows for which an earlier
-                row has the same or a later time stamp. ``source`` then states how many rows were dropped.
+            repair: whether to drop invalid rows: rows with a number that is not finite, and rows whose time stamp is
+                not later than all earlier time stamps. ``source`` then states how many rows were dropped.
 
         Raises:
             FileFormatError: when a row is invalid; the message names file, line and remedy.

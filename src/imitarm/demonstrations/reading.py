@@ -92,8 +92,8 @@ class ReadOptions:
 
         Raises:
             FileFormatError: when the file names an unknown unit.
-            InputError: when the option contradicts the file, or the file has time stamps and a duration or rate is
-                also given.
+            InputError: when the option contradicts the file, or when a duration or rate is given for a file with time
+                stamps.
         """
         if self.duration is not None or self.rate is not None:
             raise InputError(f"{source}: has its own time stamps; leave out duration and rate")
@@ -190,7 +190,7 @@ READERS: Registry[type[Reader]] = Registry("reader", "imitarm.readers", _BUILT_I
 
 
 def files_of(paths: Paths) -> list[str]:
-    """Return the files to read; a folder is replaced by its files that have the suffix of a reader.
+    """Return the files to read; a folder is replaced by those of its files whose suffix belongs to a reader.
 
     The files of a folder are sorted in natural order, ``demo_2`` before ``demo_10``. Subfolders are ignored.
 

@@ -60,7 +60,7 @@ class DemonstrationRecorder:
         return "\n".join([*(f"# {key}: {value}" for key, value in remarks.items()), ",".join(names), ""])
 
     def write(self, time: float, q: Array) -> None:
-        """Add a sample, unless its time is not later than the time of the previous sample.
+        """Add a sample; a sample that is not later than the previous sample is ignored.
 
         Args:
             time: time of the sample [s].

@@ -1,8 +1,8 @@
 """Readers of text tables: imitarm's own CSV, and any other table of numbers.
 
-Column names are read from a row of their own or from a remark, which may be anywhere in the file. A remark is a line
-that starts with ``#`` or ``%``. If nothing in the file looks like column names, the meaning of the columns is derived
-from their number. An unknown unit is an error. A remark that looks like column names but can't be understood is also an
+Column names are in a separate row or in a remark. The remark may be anywhere in the file. A remark is a line that
+starts with ``#`` or ``%``. If nothing in the file looks like column names, the meaning of the columns is derived from
+their number. An unknown unit is an error. A remark that looks like column names but can't be understood is also an
 error.
 """
 

@@ -174,7 +174,7 @@ class Comparison:
         difference: mean difference, first method minus second, over the recordings for which both methods have a value.
         relative: ``difference`` relative to the absolute mean of the second method; nan where that mean is zero.
         p: p-value of ``difference``: how probable a difference of at least this size would be if the two methods were
-            equal. It is computed by random sign flips of the persons' differences.
+            equal. The p-value is computed by random sign flips of the persons' differences.
         corrected: ``p`` after Holm's correction for all comparisons that are made together.
     """
 
@@ -202,19 +202,19 @@ def compare(ours: Values, theirs: Values) -> Comparison:
 def rate_interval(outcomes: Values) -> Interval:
     r"""Return the success rate, averaged over persons, with its 95 % interval.
 
-    The trials of one person are similar. Therefore N trials count only as :math:`N / D` independent trials, for which
-    the Wilson interval is computed (Rao and Scott, Biometrics 1992). :math:`D = 1 + (m - 1) \rho` is the design effect
-    of m trials per person. :math:`\rho` is the correlation between trials of one person. The correlation is estimated
-    from the variance of the persons' success rates, compared with the variance that chance alone would cause. An
-    estimate from a few persons is inaccurate. It is therefore averaged with a prior correlation of 0.3, which has the
-    weight of two persons. If all trials had the same result, or if there is only one person, the correlation is set to
-    0.3. :math:`N / D` lies between the number of persons and N.
+    The trials of one person are similar. Therefore N trials count only as :math:`N / D` independent trials. The Wilson
+    interval is computed for this smaller number of trials (Rao and Scott, Biometrics 1992).
+    :math:`D = 1 + (m - 1) \rho` is the design effect of m trials per person. :math:`\rho` is the correlation between
+    trials of one person. The correlation is estimated from the variance of the persons' success rates, compared with
+    the variance that chance alone would cause. An estimate from a few persons is inaccurate. It is therefore averaged
+    with a prior correlation of 0.3, which has the weight of two persons. If all trials had the same result, or if there
+    is only one person, the correlation is set to 0.3. :math:`N / D` lies between the number of persons and N.
 
     With this rule alone, one more failure could make the interval narrower. For example, the persons seem to differ if
     only one person fails, but seem to be alike if a second person fails as well. To prevent this effect, the function
-    also computes the interval of every result that is at least as good as ``outcomes`` in each trial, and returns the
-    lowest of the lower ends. In the same way, it computes the interval of every result that is at least as bad as
-    ``outcomes`` in each trial, and returns the highest of the upper ends.
+    also computes the intervals of all results that are at least as good as ``outcomes`` in each trial. It returns the
+    lowest of their lower ends. In the same way, it considers all results that are at least as bad as ``outcomes`` in
+    each trial, and returns the highest of their upper ends.
 
     Args:
         outcomes: outcome of each trial, 1 for success, 0 for failure.

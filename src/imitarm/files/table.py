@@ -48,9 +48,9 @@ class Table:
     Attributes:
         path: path of the file as given by the caller.
         remarks: the ``key: value`` remarks before the numbers, keys in lower case.
-        names: column names. They come from a separate row, or from a remark before the numbers that has one word for
-            each column; if there are several such remarks, the last one counts. Units from a row of units are added in
-            brackets (``x [mm]``). The value None means that the file has no column names.
+        names: column names. They come from a separate row. Without this row, they come from the last remark before the
+            numbers that has one word for each column. Units from a row of units are added in brackets (``x [mm]``). The
+            value None means that the file has no column names.
         values: the numbers, shape (n, columns). The caller must check for nan and inf.
         lines: line number of each row in the file, from 1, shape (n,).
         ends_in_newline: whether the file ends with a line break; if not, the last line may have been cut off.
@@ -210,8 +210,8 @@ def read_table(path: str | Path) -> Table:
 
     Raises:
         InputError: when the file can't be opened.
-        FileFormatError: when the file is empty, binary or not UTF-8, has no rows, has rows of different lengths, or
-            contains an entry that is not a number; the message names file and line.
+        FileFormatError: when the file is empty, binary or not UTF-8, when it has no rows or rows of different lengths,
+            or when an entry is not a number. The message names file and line.
     """
     return parse_table(path, read_bytes(path))
 

@@ -1,7 +1,7 @@
 """Kinematics of arms: poses, Jacobians and inverse kinematics.
 
-``pose`` contains positions and rotations, ``arm`` the model of a robot arm, and ``ik`` the inverse kinematics, which
-computes joint velocities for a desired motion of the tool.
+The module ``pose`` contains positions and rotations, and the module ``arm`` contains the model of a robot arm. The
+module ``ik`` computes joint velocities for a desired motion of the tool.
 """
 
 from __future__ import annotations

@@ -96,8 +96,8 @@ class ArmModel(ArmKinematics):
         tool_to_flange: pose of the tool's tip in the flange frame; the identity without a tool.
         tool_radius: radius of the cylinder about the tool's axis that contains the tool's head [m]; 0 without a tool.
         sphere_bodies: name of the body of each sphere of :meth:`collision_spheres`.
-        cover: radii and links of the spheres of :meth:`collision_spheres`.
-        chain: kinematics and dynamics of the arm for arrays of postures.
+        cover: object that computes the spheres of :meth:`collision_spheres`, and contains their radii and links.
+        chain: object that computes kinematics and dynamics for many postures at once.
         landmarks: shoulder, elbow and wrist, from the sites ``shoulder``, ``elbow`` and ``wrist`` in the file; None if
             a site is missing.
         notes: assumptions about values that the file does not define, and joints that are not part of the arm.
@@ -217,10 +217,10 @@ class ArmModel(ArmKinematics):
 
         Names are taken from the file; names of the tool begin with ``"tool/"``, except the site ``"tool"`` at its tip.
         The flange is the site ``"flange"``. Geoms of group 3 are used for contact, and all other geoms only for
-        drawing. If a file does not separate its geoms in this way, they are converted. The arm's joints have no
-        actuators, so a world must add the actuators that it needs. Each joint has its torque limit as
-        ``actuatorfrcrange``. A gripper has one actuator, ``"tool/opening"``, a position servo of its opening [m]. The
-        spec has no keyframes; :meth:`posture` gives the joint positions of a posture.
+        drawing. If a file does not separate its geoms in this way, the model changes their groups. The arm's joints
+        have no actuators, so a world must add the actuators that it needs. The attribute ``actuatorfrcrange`` of each
+        joint contains its torque limit. A gripper has one actuator, ``"tool/opening"``, a position servo of its opening
+        [m]. The spec has no keyframes; :meth:`posture` gives the joint positions of a posture.
         """
         return self._spec.copy()
 
@@ -233,7 +233,8 @@ class ArmModel(ArmKinematics):
             prefix: the prefix of the arm's names in the world.
 
         Returns:
-            shape (model.nq,).
+            Joint positions of the world, shape (model.nq,). Joints that belong neither to the arm nor to its tool are
+            at ``model.qpos0``.
 
         Raises:
             InputError: if the world does not contain this arm.
@@ -324,7 +325,8 @@ class ArmModel(ArmKinematics):
             qdd: joint accelerations, shape (n_joints,) [rad/s^2].
 
         Returns:
-            shape (n_joints,) [N m]; without rotor inertia, damping and friction of the joints.
+            Joint torques, shape (n_joints,) [N m]. They do not include rotor inertia, damping and friction of the
+            joints.
 
         Raises:
             InputError: if a link has no usable mass; see :meth:`check_dynamics`.

@@ -27,7 +27,8 @@ def usable_posture(
 ) -> tuple[Array, tuple[str, ...]]:
     """Return a usable home posture and notes for the user.
 
-    The posture is the middle of the joints' ranges if this posture is usable, otherwise the best of many postures.
+    A posture is usable if it is not singular and its links are at least 20 mm apart. If the middle of the joints'
+    ranges is usable, the function returns it. Otherwise, the function returns the best of many postures.
 
     Args:
         model: a compiled model with a site ``flange``.

@@ -426,10 +426,10 @@ def complete_home(
 ) -> tuple[dict[str, float], tuple[str, ...]]:
     """Return a position for every joint of ``model``, and notes on the choice.
 
-    A joint that ``given`` names gets its position from ``given``. A tool's fingers are open, other joints that do not
-    belong to the arm are in the middle of their ranges, and coupled joints follow their leader. The arm's own joints
-    are also in the middle of their ranges if this posture is not singular and its links are at least 20 mm apart.
-    Otherwise, the function chooses the best of many postures for the arm.
+    If ``given`` contains the position of a joint, this position is used. A tool's fingers are open, other joints that
+    do not belong to the arm are in the middle of their ranges, and coupled joints follow their leader. The arm's own
+    joints are also in the middle of their ranges if this posture is not singular and its links are at least 20 mm
+    apart. Otherwise, the function chooses the best of many postures for the arm.
     """
     home: dict[str, float] = {}
     for index in range(model.njnt):

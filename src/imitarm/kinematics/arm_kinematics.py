@@ -121,7 +121,7 @@ class ArmMemory:
         self._qpos = self.data.qpos  # asking MuJoCo for it takes as long as the kinematics of one link
 
     def move_to(self, q: Array) -> None:
-        """Compute the kinematics at ``q``, shape (n,), unless the last computation was for this posture."""
+        """Compute the kinematics at ``q``, shape (n,); if the last computation was for the same posture, do nothing."""
         posture = q.tobytes()
         if posture != self.posture:
             self._qpos[self._positions] = q
@@ -280,7 +280,7 @@ class ArmKinematics:
         return np.array(memory.linear[:, self._dofs])
 
     def sew_points(self, q: ArrayLike) -> Array:
-        """Return shoulder, elbow and wrist in the base frame, shape (3, 3) [m].
+        """Return the positions of shoulder, elbow and wrist in the base frame, shape (3, 3) [m].
 
         Raises:
             InputError: if the arm's file does not define shoulder, elbow and wrist.
@@ -346,7 +346,7 @@ def find_posture(
         seed: seed of the random postures.
 
     Returns:
-        shape (n_joints,) [rad]; position within 1e-6 m and rotation within 1e-6 rad.
+        Joint positions, shape (n_joints,) [rad]. They bring the frame to within 1e-6 m and 1e-6 rad of ``pose``.
 
     Raises:
         UnreachableError: if no posture reaches the pose; the message names the pose and the error of the best posture.

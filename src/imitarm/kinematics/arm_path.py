@@ -234,8 +234,8 @@ def track(arm: ArmModel, start: Array, positions: Array, quaternions: Array, dri
         start: posture before the first pose, shape (n_joints,) [rad].
         positions: positions of the tool's tip, shape (n, 3) [m].
         quaternions: rotations tool_to_base, wxyz, shape (n, 4).
-        drift: posture that the arm gradually approaches until the last pose, by joint motions that do not move the
-            tool (self-motion), shape (n_joints,) [rad]; None: there is no self-motion.
+        drift: posture that the arm gradually approaches by self-motion (joint motion that does not move the tool),
+            shape (n_joints,) [rad]; None: no self-motion.
 
     Returns:
         Joint positions, shape (n, n_joints) [rad]. They bring the tool to within 0.1 mm and 0.1 mrad of each pose;

@@ -1,7 +1,7 @@
-"""The XML of a robot's file, before MuJoCo compiles it: wrong entries are rejected, and the meshes are found.
+"""Check the XML of a robot's file before MuJoCo compiles it, and find the meshes.
 
-MuJoCo drops or misreads some wrong entries without a message. Every message here names the element, its line and the
-remedy.
+MuJoCo drops or misreads some wrong entries without a message. Every error message of this module names the element, its
+line and the remedy.
 """
 
 from __future__ import annotations
@@ -184,7 +184,7 @@ def check_key_lengths(n_positions: int, path: Path, root: XmlElement) -> None:
 
 
 def check_units(model: mujoco.MjModel, joints: tuple[str, ...], path: Path, root: XmlElement) -> None:
-    """Reject hinge limits that the file gives in degrees but that were read as radians, or the reverse.
+    """Reject hinge limits that were read in the wrong unit: degrees instead of radians, or radians instead of degrees.
 
     Raises:
         FileFormatError: when the limits are in the wrong unit; the message names a joint and its line.

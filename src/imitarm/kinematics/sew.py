@@ -73,7 +73,8 @@ def sew_angle(
         convention: ``"stereographic"`` or ``"conventional"``.
 
     Returns:
-        shape (...) [rad], in [-pi, pi]; nan where the angle is undefined (a straight arm) or a point is nan.
+        SEW angle, shape (...) [rad], in [-pi, pi]; nan where a point is nan, the arm is straight, or the reference
+        direction is undefined.
 
     Raises:
         UnknownNameError: when the convention is not known.
@@ -108,7 +109,7 @@ def sew_jacobian(points: Array, jacobians: Array, *, convention: str = "stereogr
         convention: see :func:`sew_angle`.
 
     Returns:
-        angle [rad] and its Jacobian, shape (n,); nan where the angle is undefined.
+        Angle [rad], and its Jacobian, shape (n,); both are nan if the angle is undefined.
     """
     shoulder, elbow, wrist = points.tolist()
     found = one_angle(shoulder, elbow, wrist, convention)

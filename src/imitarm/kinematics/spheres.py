@@ -37,7 +37,8 @@ class SphereCover:
         dofs: index of each joint's velocity in the model, shape (n_joints,).
         owners: index of the body that carries each sphere, shape (m,).
         local: centers of the spheres in the frames of these bodies, shape (m, 3) [m].
-        root: a body; MuJoCo gives the twists of the joints about the centre of mass of this body.
+        root: index of the arm's root body. MuJoCo gives the twists of the joints about the centre of mass of this body
+            and all bodies that it carries.
     """
 
     def __init__(self, model: mujoco.MjModel, working: mujoco.MjModel, names: Sequence[str]) -> None:
@@ -112,8 +113,9 @@ class SphereCover:
     def speeds(self, data: mujoco.MjData, spheres: NDArray[np.int_], centers: Array, normals: Array) -> Array:
         """Return the speed of spheres along given directions per unit of joint speed, shape (k, n_joints) [m/rad].
 
-        MuJoCo stores the twist ``(w, v)`` of each joint about the centre of mass ``o``. This twist moves a point ``c``
-        along ``n`` at the rate ``n.(v + w x (c - o)) = n.v + w.((c - o) x n)``.
+        MuJoCo stores the twist of each joint: the angular velocity ``w`` of the moved bodies, and their velocity ``v``
+        at the arm's centre of mass ``o``. This twist moves a point ``c`` along ``n`` at the rate
+        ``n.(v + w x (c - o)) = n.v + w.((c - o) x n)``.
 
         Args:
             data: the kinematics of a posture.
