@@ -18,6 +18,7 @@ from imitarm.kinematics.ik_problem import Box
 from imitarm.kinematics.limits import JointLimits
 from imitarm.safety import SafetyFilter
 from imitarm.scene import HalfSpace, Scene, Sphere
+from imitarm.scene.arm_rows import _room
 from imitarm.scene.clearance import SelfClearance
 from imitarm.scene.clearance_limit import ClearanceLimit
 from imitarm.scene.distances import KINDS as PACKED_KINDS
@@ -175,3 +176,12 @@ def test_both_ways_are_really_different_ways(monkeypatch):
     ClearanceLimit(arm, 0.02).near(posture(rng, arm), scene_around(rng, KINDS))
     SelfClearance(arm).rows(arm.home)
     assert {"obstacle_rows", "self_rows"} <= set(calls)
+
+
+def test_users_that_alternate_share_memory():
+    """One needs more rows, the other more scratch memory; both then use one room that is large enough."""
+    memory = ARMS["sawyer"].at(ARMS["sawyer"].home)
+    memory.kept.pop("room", None)
+    rooms = [_room(memory, size, scratch) for size, scratch in ((5, 900), (80, 10), (5, 900), (80, 10))]
+    assert rooms[1] is rooms[2] is rooms[3]
+    assert rooms[3].rows.shape == (80, 7) and rooms[3].scratch.shape == (900,)

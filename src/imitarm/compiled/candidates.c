@@ -47,23 +47,31 @@ typedef struct {
 
 static int64_t words(int64_t bytes) { return (bytes + 7) / 8; }
 
+/* The next part of scratch, after `used` doubles; null if scratch is null, which only counts. */
+static void *part(double *scratch, int64_t *used, int64_t n)
+{
+    int64_t begin = *used;
+    *used += n;
+    return scratch ? scratch + begin : 0;
+}
+
 static int64_t lay_out(Memory *memory, const LeastCost *c, int64_t n, double *scratch)
 {
-    double *begin = scratch;
-    memory->solids = (Solid *)scratch, scratch += words((int64_t)sizeof(Solid) * n * c->H);
-    memory->obstacles = (int64_t *)scratch, scratch += n;
-    memory->free = scratch, scratch += 3 * c->H;
-    memory->scaled = scratch, scratch += 3 * c->C;
-    memory->smooth = scratch, scratch += c->C;
-    memory->order = (int64_t *)scratch, scratch += c->C;
-    memory->centers = scratch, scratch += 3 * c->R * c->H * c->S;
-    memory->gaps = scratch, scratch += c->R * n * c->H * c->S;
-    memory->reduction = scratch, scratch += c->R * n * c->H;
-    memory->costs = scratch, scratch += c->R * c->C;
-    memory->arrived = (int64_t *)scratch, scratch += c->R * c->H;
-    memory->near = (int64_t *)scratch, scratch += c->R * n * c->H * c->S;
-    memory->margins = scratch, scratch += n * c->H;
-    return scratch - begin;
+    int64_t used = 0;
+    memory->solids = part(scratch, &used, words((int64_t)sizeof(Solid) * n * c->H));
+    memory->obstacles = part(scratch, &used, n);
+    memory->free = part(scratch, &used, 3 * c->H);
+    memory->scaled = part(scratch, &used, 3 * c->C);
+    memory->smooth = part(scratch, &used, c->C);
+    memory->order = part(scratch, &used, c->C);
+    memory->centers = part(scratch, &used, 3 * c->R * c->H * c->S);
+    memory->gaps = part(scratch, &used, c->R * n * c->H * c->S);
+    memory->reduction = part(scratch, &used, c->R * n * c->H);
+    memory->costs = part(scratch, &used, c->R * c->C);
+    memory->arrived = part(scratch, &used, c->R * c->H);
+    memory->near = part(scratch, &used, c->R * n * c->H * c->S);
+    memory->margins = part(scratch, &used, n * c->H);
+    return used;
 }
 
 /* Number of doubles that a step with n obstacles needs as scratch. */
@@ -200,12 +208,12 @@ static int64_t prepare(Memory *memory, const LeastCost *c, const Path *path, con
     return kept;
 }
 
-static void add_spheres(double *centers, const double *tip, const LeastCost *c, const Path *path, int64_t sample)
+/* The centre of a sphere of the tool, whose tip is at a sample of the path. */
+static void place_sphere(double *center, const double *tip, const double *sphere, const Path *path, int64_t sample)
 {
     const double *R = path->n_rotations ? path->rotations + 9 * (path->n_rotations > 1 ? sample : 0) : 0;
-    for (int64_t k = 0; k < c->S; k++)
-        for (int r = 0; r < 3; r++)
-            centers[3 * k + r] = tip[r] + (R ? dot(R + 3 * r, c->spheres + 3 * k) : 0.0);
+    for (int r = 0; r < 3; r++)
+        center[r] = tip[r] + (R ? dot(R + 3 * r, sphere) : 0.0);
 }
 
 /* The motion without coupling at one speed of the phase: centres of the spheres (H, S), and whether it has arrived. */
@@ -219,7 +227,9 @@ static void predict(Memory *memory, const LeastCost *c, const Path *path, const 
         const double *p = path->positions + 3 * i;
         for (int k = 0; k < 3; k++)
             tip[k] = p[k] + (x - (double)i) * (p[3 + k] - p[k]) + memory->free[3 * m + k];
-        add_spheres(memory->centers + 3 * c->S * (c->H * rate + m), tip, c, path, (int64_t)rint(x));
+        double *centers = memory->centers + 3 * c->S * (c->H * rate + m);
+        for (int64_t k = 0; k < c->S; k++)
+            place_sphere(centers + 3 * k, tip, c->spheres + 3 * k, path, (int64_t)rint(x));
         memory->arrived[c->H * rate + m] = phase >= 1.0;
     }
 }
@@ -234,9 +244,7 @@ static void reduce(Memory *memory, const LeastCost *c, const Path *path, const d
             if (!memory->arrived[c->H * rate + m])
                 continue;
             for (int64_t k = 0; k < c->S; k++) {
-                LeastCost one = *c;
-                one.S = 1, one.spheres = c->spheres + 3 * k;
-                add_spheres(center, path->goal, &one, path, path->n);
+                place_sphere(center, path->goal, c->spheres + 3 * k, path, path->n);
                 double gap = signed_distance(memory->solids + i * c->H + m, center, 0) - c->radii[k];
                 gap -= margins ? margins[c->H * memory->obstacles[i] + m] : 0.0;
                 least = fmin(least, gap);

@@ -25,6 +25,7 @@ _FUNCTIONS: dict[str, tuple[Any, ...]] = {
     "imitarm_sources": (),
     "least_cost_choice": (_P, _D, *[_P] * 6),
     "least_cost_scratch": (_P, _I),
+    "least_cost_velocity": (_I, _I, _P, _P, _D, _D, _P, _P, _P, _I, _P, _P, _P),
     "obstacle_rows": (_P, _D, _D, *[_P] * 12),
     "sphere_centers": (_P, _P),
     "self_rows": (*[_P] * 3, _I, _D, _D, _I, _D, _D, _D, *[_P] * 6),

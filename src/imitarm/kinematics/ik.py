@@ -16,6 +16,8 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from imitarm.compiled import library
+from imitarm.compiled.kernels import address
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.damped_ik import damped_least_squares, damped_with_small_angle, filtered_svd
@@ -33,6 +35,7 @@ _EFFORT, _CHANGE = 1e-5, 1e-6  # "qp": weights of the joint velocity and of its 
 _TINY_ROW = 1e-6
 _ROUNDING = 1e-8  # [rad/s]
 _VIOLATED = 1e-9
+_KEPT = 1e-10  # [rad/s] a limit that is violated by less is kept
 _FLOAT64 = np.dtype(np.float64)
 
 
@@ -297,6 +300,11 @@ def quadratic_program(problem: IKProblem) -> Array:
     jacobian, target, thrift = problem.tasks[0]
     if len(problem.tasks) > 1:
         jacobian, target = _stacked(problem.tasks)
+    matrix, least, light = _sorted_rows(problem.rows) if problem.rows else (None, None, ())
+    if not light:
+        found = _compiled(problem, jacobian, target, thrift, matrix, least)
+        if found is not None:
+            return found
     hessian = jacobian.T.dot(jacobian)
     linear = target.dot(jacobian)
     effort = _EFFORT
@@ -304,7 +312,6 @@ def quadratic_program(problem: IKProblem) -> Array:
         effort += _CHANGE
         linear += (thrift * _CHANGE) * problem.velocity
     hessian += _scaled_eye(len(linear), thrift * effort)
-    matrix, least, light = _sorted_rows(problem.rows) if problem.rows else (None, None, ())
     velocity = _least_cost(problem.box, matrix, least, hessian, linear)
     for rows in light:  # a price is convex: where it is paid at all it stands in full
         active = rows.matrix.dot(velocity) < rows.lower - _VIOLATED
@@ -315,6 +322,22 @@ def quadratic_program(problem: IKProblem) -> Array:
             linear += rows.lower[active].dot(weighted)
             velocity = _least_cost(problem.box, matrix, least, hessian, linear)
     return velocity
+
+
+def _compiled(
+    problem: IKProblem, jacobian: Array, target: Array, thrift: float, matrix: Array | None, least: Array | None
+) -> Array | None:
+    """Return the minimum that compiled code finds; None without this code, or if the limits contradict each other."""
+    kernel = library()
+    if kernel is None:
+        return None
+    velocity, n = np.empty(problem.arm.n_joints), problem.arm.n_joints
+    before = None if problem.velocity is None else problem.velocity.tobytes()
+    rows = (0, None, None) if matrix is None or least is None else (len(least), matrix.tobytes(), least.tobytes())
+    places = jacobian.tobytes(), target.tobytes(), thrift * _EFFORT, thrift * _CHANGE, before
+    box = problem.box.lower.tobytes(), problem.box.upper.tobytes()
+    failed = kernel.least_cost_velocity(n, len(target), *places, *box, *rows, address(velocity))
+    return None if failed else velocity
 
 
 def _stacked(tasks: list[TaskRows]) -> tuple[Array, Array]:
@@ -355,7 +378,7 @@ def _least_cost(box: Box, matrix: Array | None, least: Array | None, hessian: Ar
     else:
         lower, upper = np.empty(n + len(least)), np.empty(n + len(least))
         lower[:n], lower[n:], upper[:n], upper[n:] = box.lower, least, box.upper, 1e30
-    velocity, _, status, _ = daqp.solve(hessian, -linear, matrix, upper, lower, _plain(len(lower)))
+    velocity, _, status, _ = daqp.solve(hessian, -linear, matrix, upper, lower, _plain(len(lower)), primal_tol=_KEPT)
     if status <= 0 and len(least):
         lengths = np.sqrt(np.einsum("ij,ij->i", matrix, matrix))
         moved = lengths > _TINY_ROW  # no velocity changes the other rows
@@ -363,7 +386,9 @@ def _least_cost(box: Box, matrix: Array | None, least: Array | None, hessian: Ar
         nearest = least_violation(box, matrix / lengths[:, None], least / lengths)
         reached = np.minimum(least, matrix @ nearest - _ROUNDING * lengths)
         lower, upper = np.append(box.lower, reached), np.append(box.upper, np.full(len(reached), 1e30))
-        velocity, _, status, _ = daqp.solve(hessian, -linear, matrix, upper, lower, _plain(len(lower)))
+        velocity, _, status, _ = daqp.solve(
+            hessian, -linear, matrix, upper, lower, _plain(len(lower)), primal_tol=_KEPT
+        )
         if status <= 0:
             velocity, status = nearest, 1
     if status <= 0:  # only lost digits can bring us here, since the box is never empty, and standing is safe

@@ -18,7 +18,7 @@ from imitarm.compiled.kernels import Record, address
 from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel
 from imitarm.kinematics.arm_kinematics import ArmMemory
-from imitarm.kinematics.ik_problem import Box, Rows
+from imitarm.kinematics.ik_problem import Box, Rows, violable
 from imitarm.kinematics.spheres import SphereCover
 from imitarm.scene.packed_record import record_of
 from imitarm.scene.scene import Scene
@@ -89,9 +89,9 @@ def compiled_near_rows(
     """
     packed = scene.packed
     record, dt = record_of(packed)
-    room = _room(memory, "near rows", len(packed) * len(reach), (3 * memory.n_joints + 1) * len(reach))
+    room = _room(memory, len(packed) * len(reach), (3 * memory.n_joints + 1) * len(reach))
     places = *_arm_of(cover, memory), address(reach), limit.address
-    more = [None if array is None else address(array) for array in (margins, velocity, *box)]
+    more = [None if array is None else array.tobytes() for array in (margins, velocity, *box)]
     k = library().obstacle_rows(record.address, dt, scene.stamp, *places, *more, *room.addresses)
     if not k:
         return None
@@ -194,16 +194,17 @@ class SpherePairs:
             q: joint positions, shape (n_joints,) [rad].
             nearness: definition of the near pairs.
             demand: limit of the rate at which each distance may shrink.
-            box: bounds of the joint velocity; if no velocity within these bounds violates an inequality, the result may
-                be None.
+            box: bounds of the joint velocity; if no velocity within these bounds violates an inequality, the result is
+                None.
         """
         if not has_kernels(arm):
-            return self._rows_by_numpy(arm, q, nearness)
+            found = self._rows_by_numpy(arm, q, nearness)
+            return None if found is None or not _has_effect(found, demand, box) else found
         memory = arm.at(q)
         n_groups, _, _, most = nearness
-        room = _room(memory, "own rows", most + n_groups, 2 * (len(self.sums) + len(self.starts)))
+        room = _room(memory, most + n_groups, 2 * (len(self.sums) + len(self.starts)))
         within = () if box is None else [numbers(bound, arm.n_joints, "box") for bound in box]
-        bounds = tuple(address(bound) for bound in within) or (None, None)
+        bounds = tuple(bound.tobytes() for bound in within) or (None, None)
         places = self._record.address, *_arm_of(self.cover, memory)
         k = library().self_rows(*places, *nearness, *demand, *bounds, *room.addresses)
         if not k:
@@ -234,6 +235,15 @@ class SpherePairs:
         return OwnRows(pairs, distance, self.cover.parting(arm.at(q).data, outer, inner, points, normals))
 
 
+def _has_effect(found: OwnRows, demand: Demand, box: Box | None) -> bool:
+    """Return whether some velocity in a box violates an inequality; True without a box."""
+    if box is None:
+        return True
+    room = found.distance - demand.clearance
+    lower = np.where(room < 0.0, -demand.retreat, -demand.gain) * room
+    return bool(violable(found.gradient, lower, box).any())
+
+
 class _Room:
     """Memory for compiled code, used again in every step.
 
@@ -251,11 +261,13 @@ class _Room:
         self.addresses = [address(array) for array in (self.scratch, self.indices, self.values, self.rows)]
 
 
-def _room(memory: ArmMemory, purpose: str, size: int, n_scratch: int) -> _Room:
-    """Return memory for at least ``size`` rows, of this arm in this thread."""
-    room: _Room | None = memory.kept.get(purpose)
+def _room(memory: ArmMemory, size: int, n_scratch: int) -> _Room:
+    """Return memory for at least ``size`` rows, of this arm in this thread; it grows to what its largest user needs."""
+    room: _Room | None = memory.kept.get("room")
     if room is None or len(room.rows) < size or len(room.scratch) < n_scratch:
-        room = memory.kept[purpose] = _Room(size, memory.n_joints, n_scratch)
+        if room is not None:
+            size, n_scratch = max(size, len(room.rows)), max(n_scratch, len(room.scratch))
+        room = memory.kept["room"] = _Room(size, memory.n_joints, n_scratch)
     return room
 
 

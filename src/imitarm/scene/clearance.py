@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.kinematics.arm import ArmModel
-from imitarm.kinematics.ik_problem import Box, Rows, violable
+from imitarm.kinematics.ik_problem import Box, Rows
 from imitarm.kinematics.spheres import COLLISION_GROUP
 from imitarm.scene.arm_rows import Demand, Nearness, OwnRows, SpherePairs
 from imitarm.validation import finite_number, instance, whole_number
@@ -143,12 +143,7 @@ class SelfClearance:
             The inequalities; None if no pair is near, or if no velocity in the box violates an inequality.
         """
         found = self._found(q, box)
-        if found is None:
-            return None
-        lower = self.lower(found.distance - self.clearance)
-        if box is not None and not violable(found.gradient, lower, box).any():
-            return None
-        return Rows(found.gradient, lower)
+        return None if found is None else Rows(found.gradient, self.lower(found.distance - self.clearance))
 
     def near(self, q: ArrayLike) -> tuple[Array, Array] | None:
         """Return gradients of the distances of near pairs (k, n_joints) [m/rad], and distance minus clearance (k,) [m].
