@@ -5,7 +5,8 @@
 Changed files are those that differ from ``--against``: by default from where this branch left ``main``; on ``main``
 itself from the last commit. A test is the nearer to a change the fewer imports lie between: a test file that has
 changed, a test that imports a changed module, a test that imports a module that imports one, and so on. Tests marked
-``slow`` are left out, and what does not fit into the time is counted and named.
+``slow`` are left out, and what does not fit into the time is counted and named. If C code has changed, it is compiled
+before the tests.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from functools import lru_cache
 from pathlib import Path
 
 import pytest
+
+from imitarm.compiled import build
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("src", "tests", "benchmarks")
@@ -169,7 +172,8 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=45.0, help="stop after so many; default: 45")
     parser.add_argument("--list", action="store_true", help="print the test files with their distances, and stop")
     arguments = parser.parse_args()
-    near = distances(changed_files(arguments.against))
+    changed = changed_files(arguments.against)
+    near = distances(changed)
     files = sorted(near, key=lambda path: (near[path], path))
     if arguments.list:
         sys.stdout.write("".join(f"{near[path]} {path.relative_to(ROOT)}\n" for path in files))
@@ -177,6 +181,8 @@ def main() -> int:
     if not files:
         sys.stdout.write("no test depends on what has changed\n")
         return 0
+    if any(path.suffix in {".c", ".h"} for path in changed):  # a library of other sources is not used
+        sys.stdout.write(f"{build()}\n")
     words = ["-q", "-m", "not slow", "--rootdir", str(ROOT), *(str(path) for path in files)]
     nearest = Nearest(near, arguments.seconds)
     status = pytest.main(words, plugins=[nearest])

@@ -60,6 +60,18 @@ def test_every_module_of_the_package_is_reached_by_a_test() -> None:
     assert unreached == []
 
 
+def test_a_change_of_c_code_is_compiled_and_reaches_its_tests(monkeypatch, capsys) -> None:
+    source, run = quick.ROOT / "src/imitarm/compiled/candidates.c", []
+    found = {path.name for path in quick.distances([source])}
+    assert {path.name for path in (quick.ROOT / "tests").glob("test_*compiled*.py")} <= found
+    monkeypatch.setattr(quick, "changed_files", lambda _: [source])
+    monkeypatch.setattr(quick, "build", lambda: run.append("build") or "built it")
+    monkeypatch.setattr(pytest, "main", lambda *_, **__: run.append("tests") or 0)
+    monkeypatch.setattr(sys, "argv", ["quick.py"])
+    assert quick.main() == 0
+    assert run == ["build", "tests"] and capsys.readouterr().out == "built it\n"
+
+
 def test_a_failure_counts_and_time_ends_the_run(tmp_path: Path) -> None:
     (tmp_path / "test_a.py").write_text(
         "def test_a():\n    assert 0\n\ndef test_b():\n    pass\n\ndef test_c():\n    pass\n"
