@@ -153,7 +153,7 @@ def human_arm_angles(upper: ArrayLike, forearm: ArrayLike, hand: ArrayLike, prev
         previous: joint angles in the previous camera frame, shape (7,) [rad]; None: zeros.
 
     Returns:
-        shape (7,) [rad].
+        The joint angles, shape (7,) [rad].
     """
     u, f = (np.asarray(v, dtype=float) for v in (upper, forearm))
     held = np.zeros(7) if previous is None else np.asarray(previous, dtype=float)

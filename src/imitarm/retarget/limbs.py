@@ -129,7 +129,7 @@ def correct_limbs(
             corrected elbow.
 
     Returns:
-        the corrected positions of elbow and wrist, shape (..., 3) [m] each.
+        The corrected positions of elbow and wrist, shape (..., 3) [m] each.
     """
     s, e, w = (np.asarray(point, dtype=float) for point in (shoulder, elbow, wrist))
     upper, fore = _direction(e - s), _direction(w - e)
@@ -159,7 +159,7 @@ def fit_limbs(points: Array, confidence: Array, lengths: LimbLengths, *, rounds:
         rounds: number of Gauss-Newton steps.
 
     Returns:
-        positions of shoulder, elbow and wrist, shape (3, 3) [m]. The distances between them are exactly the given
+        Positions of shoulder, elbow and wrist, shape (3, 3) [m]. The distances between them are exactly the given
         lengths.
     """
     # plain floats: for nine numbers five times as fast as NumPy

@@ -318,9 +318,9 @@ class Retargeting:
             nobody.
         elbows: unit vectors from the person's shoulder to the elbow in the base frame, shape (n, 3); nan where unknown.
         closed: whether the gripper should be closed at each sample, shape (n,) bool.
-        states: states of the engagement, shape (n,), values of :class:`~imitarm.retarget.engagement.EngagementState`.
+        states: state at each sample, shape (n,), values of :class:`~imitarm.retarget.engagement.EngagementState`.
         notes: counts and other figures that the method reports, by name.
-        title: title of the method for tables and reports; empty: ``method``.
+        title: title of the method for tables and reports; if empty, ``method`` is used.
         caption: one sentence about the method for reports.
         shown_times: time in the person's recording that corresponds to each sample, counted from the first skeleton,
             shape (n,) [s]. Only methods that slow the motion down need it. None: equal to ``times``.

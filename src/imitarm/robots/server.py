@@ -63,9 +63,9 @@ class Supervisor:
     a new challenge, so a copy of an old ENABLE message has no effect. After a restart of the client, its user must
     enable the robot again. Any client may stop the robot.
 
-    A command is valid if it passes the :class:`~imitarm.transmission.datagram_filter.DatagramFilter`, is for this arm,
-    and is within the joints' position and velocity limits. The command must also be near the set-point. No joint may
-    differ from it by more than the joint moves in 0.15 s at full speed.
+    A command is valid if it passes the :class:`~imitarm.transmission.datagram_filter.DatagramFilter`, is meant for this
+    arm, and is within the joints' position and velocity limits. The command must also be near the set-point. No joint
+    may differ from it by more than the joint moves in 0.15 s at full speed.
 
     Let :math:`q_c` be the commanded position and :math:`\dot q_c` its velocity. The set-point q moves towards
     :math:`q_c` at the following velocity:

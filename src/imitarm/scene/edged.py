@@ -128,7 +128,7 @@ class Cylinder(PosedObstacle):
 
     Attributes:
         pose: obstacle_to_base, at the middle of the cylinder's axis, with z along this axis.
-        radius: [m].
+        radius: radius [m].
         length: length from end to end [m].
     """
 
@@ -287,7 +287,7 @@ def standard_fixtures(*, floor: float = -0.75, pedestal_radius: float = 0.12) ->
 
     Args:
         floor: height of the floor in the base frame [m]; if this height is 0 or more, there is no pedestal.
-        pedestal_radius: [m].
+        pedestal_radius: radius of the pedestal [m].
 
     Raises:
         InputError: when a number is not finite, or the radius is not positive.

@@ -125,7 +125,7 @@ class Family(NamedTuple):
 
     Attributes:
         kinds: names of the shapes.
-        formula: see above.
+        formula: the distance formula.
         prepare: function that computes the parameters (..., n) from the kinds (n,) and sizes (n, 3) of n obstacles.
     """
 
@@ -258,7 +258,7 @@ class Obstacle(ABC):
             points: points in the base frame, shape (..., 3) [m].
 
         Returns:
-            Shape (...) [m].
+            Signed distances, shape (...) [m].
 
         Raises:
             InputError: when the last axis does not have length 3 or a number is not finite.

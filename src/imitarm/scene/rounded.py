@@ -72,7 +72,7 @@ class Sphere(Obstacle):
 
     Attributes:
         center: centre in the base frame, shape (3,) [m].
-        radius: [m].
+        radius: radius [m].
     """
 
     kind: ClassVar[str] = "sphere"
@@ -97,7 +97,7 @@ class Sphere(Obstacle):
             points: points in the base frame, shape (..., 3) [m].
 
         Returns:
-            Shape (...) [m].
+            Signed distances, shape (...) [m].
 
         Raises:
             InputError: when the last axis does not have length 3 or a number is not finite.
@@ -131,7 +131,7 @@ class Capsule(Obstacle):
     Attributes:
         start: one end of the segment, in the base frame, shape (3,) [m].
         end: other end, shape (3,) [m].
-        radius: [m].
+        radius: radius [m].
     """
 
     kind: ClassVar[str] = "capsule"

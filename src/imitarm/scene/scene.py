@@ -165,7 +165,7 @@ class Scene:
             points: points in the base frame, shape (..., 3) [m].
 
         Returns:
-            Shape (n_obstacles, ...) [m], negative inside.
+            Distances, shape (n_obstacles, ...) [m], negative inside an obstacle.
 
         Raises:
             InputError: when the last axis of ``points`` does not have length 3 or a number is not finite.
@@ -195,7 +195,7 @@ class Scene:
             points: points in the base frame, shape (..., 3) [m].
 
         Returns:
-            Shape (...) [m], negative inside an obstacle.
+            Distances, shape (...) [m], negative inside an obstacle.
 
         Raises:
             InputError: when the last axis of ``points`` does not have length 3 or a number is not finite.

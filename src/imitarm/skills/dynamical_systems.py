@@ -204,7 +204,7 @@ def roll_out(step: Propagator, start: Array, target: Array) -> Array:
         target: y at the ``instants`` of all n steps, in the order of time, shape (2 n m + 1, C).
 
     Returns:
-        x and tau x', shape (2, n + 1, C).
+        The states x and tau x' at the beginning and after each step, shape (2, n + 1, C).
     """
     E = step.transition
     C = target.shape[1]

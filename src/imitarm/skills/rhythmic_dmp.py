@@ -32,9 +32,9 @@ class RhythmicDMPState(NamedTuple):
         motion: [x; P x'] with the period P, shape (2, D). The coordinates x are the position [m] and, if rotation was
             learned, a rotation vector [rad].
         periods: number of periods since the start, phi / (2 pi).
-        center: g, shape (D,).
+        center: g, the centre of the motion, shape (D,) [m, rad].
         amplitude: r, the factor by which the learned motion is multiplied.
-        period: P [s].
+        period: P, the duration of one period [s].
     """
 
     motion: Array
@@ -215,7 +215,7 @@ class RhythmicDMP:
         Args:
             state: state returned by :meth:`begin` or by the last step. To change the motion during its execution,
                 replace ``amplitude``, ``center`` or ``period`` of the state.
-            dt: [s], above 0.
+            dt: length of the step [s], above 0.
             coupling: function from position and velocity to an acceleration (3,) [m/s^2] that is added during this
                 step.
 

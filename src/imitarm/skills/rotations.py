@@ -185,12 +185,12 @@ class QuaternionDMP:
         r = \log(R R_y(s)^T), \qquad \tau^2 \ddot r = -K r - D \tau \dot r + \tau^2 c
 
     Here, c is an external angular acceleration. The logarithm is applied only to ``R R_y^T``, the rotation from the
-    target to ``R``, and not to the rotation from ``R`` to the goal. Therefore, the primitive can reproduce a rotation
-    by 270 degrees, or by three full revolutions. (Formulations that use log(q_goal conj(q)) rotate in the opposite
-    direction beyond 180 degrees.) The target is a normalised cubic spline through quaternions with continuous signs.
-    For another start or goal, the target is rotated in the base frame by ``d_start`` at the start and by ``d_goal`` at
-    the goal. A minimum-jerk profile b, from 0 to 1, blends these two rotations: ``exp((1 - b) d_start) exp(b d_goal)
-    R_y``. Both ``d_start`` and ``d_goal`` are rotations by at most 180 degrees.
+    target to ``R``, and not to the rotation from ``R`` to the goal rotation. Therefore, the primitive can reproduce a
+    rotation by 270 degrees, or by three full revolutions. (Formulations that use log(q_goal conj(q)) rotate in the
+    opposite direction beyond 180 degrees.) The target is a normalised cubic spline through quaternions with continuous
+    signs. For another start or goal, the target is rotated in the base frame by ``d_start`` at the start and by
+    ``d_goal`` at the goal. A minimum-jerk profile b, from 0 to 1, blends these two rotations: ``exp((1 - b) d_start)
+    exp(b d_goal) R_y``. Both ``d_start`` and ``d_goal`` are rotations by at most 180 degrees.
 
     Args:
         gains: ``"critical"``, ``"thesis"`` or :class:`~imitarm.skills.dynamical_systems.Gains`.
@@ -309,8 +309,8 @@ class QuaternionDMP:
         """Return the state at the start of a motion.
 
         Args:
-            start: rotation wxyz (4,); None: as learned.
-            goal: rotation wxyz (4,); None: as learned.
+            start: rotation wxyz (4,); None: the learned start.
+            goal: rotation wxyz (4,); None: the learned goal.
 
         Raises:
             InputError: when not fitted, or a quaternion is not of length one.

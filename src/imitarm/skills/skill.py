@@ -203,8 +203,8 @@ class Skill:
 
         Args:
             times: strictly increasing times from 0 to the learned duration, shape (n,) [s].
-            start: a Pose, or a position (3,) [m] with the learned rotation; None: as learned.
-            goal: a Pose, or a position (3,) [m] with the learned rotation; None: as learned.
+            start: a Pose, or a position (3,) [m] with the learned start rotation; None: the learned start.
+            goal: a Pose, or a position (3,) [m] with the learned goal rotation; None: the learned goal.
 
         Raises:
             InputError: when not fitted, or a start, a goal or a time is not valid.
@@ -233,8 +233,8 @@ class Skill:
         """Return the primitive's motion, ``round(duration / dt) + 1`` samples, with the rotation if one was learned.
 
         Args:
-            start: a Pose, or a position (3,) [m] with the learned rotation; None: as learned.
-            goal: a Pose, or a position (3,) [m] with the learned rotation; None: as learned.
+            start: a Pose, or a position (3,) [m] with the learned start rotation; None: the learned start.
+            goal: a Pose, or a position (3,) [m] with the learned goal rotation; None: the learned goal.
             duration: duration of the motion [s]; None: the learned duration.
             dt: length of a step [s], adjusted so that a whole number of steps fills the duration.
             adjustment: name of the method that changes the motion for another start or goal (see

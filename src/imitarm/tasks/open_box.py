@@ -191,7 +191,7 @@ class OpenBoxTask:
         """Return the simulated robot in :meth:`scene`, with its tool at the start.
 
         Args:
-            arm: the arm, if it has been loaded already.
+            arm: the Panda with its gripper; None: loaded here.
             control: control mode of the drives.
         """
         arm = self.arm() if arm is None else arm

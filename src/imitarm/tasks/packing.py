@@ -154,7 +154,7 @@ class PackingTask:
         """Return the simulated robot with its open gripper above the table, with cube, box and bottle.
 
         Args:
-            arm: the arm, if it has been loaded already.
+            arm: the Sawyer with the gripper; None: loaded here.
             control: control mode of the drives. The default is computed torque, which is compliant, because the gripper
                 touches the cube.
         """

@@ -100,9 +100,9 @@ def run_packing(
 
     Args:
         task: the task.
-        arm: the arm, if it has been loaded already.
-        observer: function that takes the task and its simulated robot, and returns the argument ``observe`` of
-            :func:`~imitarm.control_loop.reproduce`; see :data:`OBSERVERS`. None: :func:`sensed`.
+        arm: the Sawyer with the gripper; None: loaded here.
+        observer: function of the task and its simulated robot, one of :data:`OBSERVERS`. It returns the argument
+            ``observe`` of :func:`~imitarm.control_loop.reproduce`. None: :func:`sensed`.
         on_step: function called after each control step.
 
     Returns:

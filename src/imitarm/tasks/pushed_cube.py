@@ -141,10 +141,9 @@ def run_pushed_cube(
 
     Args:
         seed: seed of the cube's motion, of the dirt and of the noise.
-        arm: the arm with the brush, if it has been loaded already; None: the Panda.
-        observer: function that takes the true scene, the simulated robot and the seed, and returns the argument
-            ``observe`` of :func:`~imitarm.control_loop.reproduce`; see :data:`CUBE_OBSERVERS`. None:
-            :func:`sensed_cube`.
+        arm: the arm with the brush; None: the Panda, loaded here.
+        observer: function of the true scene, the simulated robot and the seed, one of :data:`CUBE_OBSERVERS`. It
+            returns the argument ``observe`` of :func:`~imitarm.control_loop.reproduce`. None: :func:`sensed_cube`.
         on_step: function called after each control step.
 
     Returns:

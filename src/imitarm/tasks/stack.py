@@ -145,7 +145,7 @@ class StackTask:
         """Return the simulated robot with its open gripper above the table.
 
         Args:
-            arm: the arm, if it is loaded already.
+            arm: the Sawyer with the gripper; None: loaded here.
             control: control mode of the drives. Contacts are expected, so the default is computed torque, which is more
                 compliant than position control.
         """

@@ -189,7 +189,7 @@ class SweepTask:
 
         Args:
             scene: obstacles on the table, which may follow tracks; None for no obstacles.
-            arm: the arm, if it has been loaded already.
+            arm: the arm with the brush; None: the Sawyer, loaded here.
             control: control mode of the drives.
         """
         arm = self.arm() if arm is None else arm
@@ -212,8 +212,8 @@ class SweepTask:
     def evaluate(self, robot: SimulatedRobot, rollout: Rollout) -> Rollout:
         """Return ``rollout`` with success or the reasons for failure (dirt outside the pan, contact, not finished).
 
-        The rollout's ``details`` contain ``"swept_fraction"`` (fraction of the crumbs in the pan) and ``"swept"``
-        (whether each crumb is in the pan).
+        The rollout's ``details`` contain ``"swept"`` (whether each crumb is in the pan) and ``"swept_fraction"`` (the
+        fraction of these crumbs).
         """
         swept = self.swept(robot)
         fraction = float(swept.mean())

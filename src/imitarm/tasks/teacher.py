@@ -102,7 +102,7 @@ class Teacher:
         joint positions every 30 ms, and the corresponding poses of the tool.
 
         Args:
-            arm: the Sawyer with the brush, if it is already loaded.
+            arm: the Sawyer with the brush; None: loaded here.
 
         Raises:
             TaskFailedError: when the dirt is not in the pan at the end.

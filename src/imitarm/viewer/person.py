@@ -52,7 +52,7 @@ class PersonMark:
     """The joint positions of a person in each frame, for drawing.
 
     Attributes:
-        name: name, unique in the 3-D scene.
+        name: name of the person, unique in the 3-D scene.
         positions: positions of the joints :data:`imitarm.capture.skeleton.JOINTS` in the world frame, shape (n_frames,
             25, 3) [m]; NaN where lost.
         tracking: :class:`~imitarm.capture.skeleton.Tracking` of each joint, shape (n_frames, 25). Inferred joints are

@@ -28,7 +28,7 @@ def states(runs: Sequence[tuple[str, Retargeting]], *, name: str = "states") -> 
     """Draw one coloured band for each method, which shows the state of the retargeter over time.
 
     Args:
-        runs: title and retargeted motion of each method.
+        runs: one pair (title, retargeted motion) for each method.
         name: name of the figure, unique in the page.
 
     Returns:
