@@ -1,4 +1,4 @@
-"""Registry: the classes of one family (for example, all policies), from this package and from other packages."""
+"""Registry: classes of one kind by name (for example, all policies), from this package and from other packages."""
 
 from __future__ import annotations
 
@@ -13,19 +13,18 @@ Item = TypeVar("Item")
 
 
 class Registry(Mapping[str, Item], Generic[Item]):
-    """The members of one family, by name; a member is imported when it is first used.
+    """Classes or objects of one kind, its *members*, by name. A member is imported when it is first used.
 
-    Built-in members are given as ``"module:attribute"``. An installed package adds its members in its
-    ``pyproject.toml``, under the family's entry-point group::
+    Another package adds a member by an entry point in its ``pyproject.toml``, here a policy with the name ``mine``::
 
         [project.entry-points."imitarm.policies"]
         mine = "my_package.my_policy:MyPolicy"
 
     Args:
-        kind: kind of the members, for messages, for example ``"policy"``.
-        group: the entry-point group, for example ``"imitarm.policies"``.
-        built_in: built-in members of this package, ``"module:attribute"`` by name, in the order in which they are
-            listed.
+        kind: what a member is, for messages, for example ``"policy"``.
+        group: group of the entry points, for example ``"imitarm.policies"``.
+        built_in: for the name of each member of this package, the place ``"module:attribute"`` from which it is
+            imported. The registry lists the members in this order.
     """
 
     def __init__(self, kind: str, group: str, built_in: Mapping[str, str]) -> None:
@@ -35,7 +34,7 @@ class Registry(Mapping[str, Item], Generic[Item]):
         self._loaded: dict[str, Item] = {}
 
     def __getitem__(self, name: str) -> Item:
-        """Return the member with the name ``name``.
+        """Import the member with the name ``name`` if necessary, and return it.
 
         Raises:
             UnknownNameError: when no member has this name; the message lists all names.
@@ -51,7 +50,7 @@ class Registry(Mapping[str, Item], Generic[Item]):
         return self._loaded[name]
 
     def register(self, name: str, item: Item) -> None:
-        """Add a member for this process, for example from a script.
+        """Add a member until the end of this process, for example in a script.
 
         Raises:
             InputError: when a built-in member has this name.

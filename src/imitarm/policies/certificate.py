@@ -1,14 +1,13 @@
-"""Proof that a path keeps its clearance: convexity gives a lower bound of the distance on every straight segment.
+"""Guarantee that a path of the tool keeps its clearance, at the samples of the path and between them.
 
-The signed distance to a convex obstacle is a convex function, so its tangent plane at any point is a lower bound
-everywhere. The tangents at two samples therefore bound the distance on the whole segment between them. The proof thus
-certifies the whole polyline, not only the samples. If the bound on a segment is too low, the distance is measured at
-further points of the segment. This ends when the bound reaches the required clearance, or when one of these points is
-too close.
+The signed distance of a point from a convex obstacle is a convex function of the point. Its tangent plane at any point
+is therefore a lower bound everywhere. The tangents at two samples give a lower bound of the distance on the straight
+segment between them. If this bound is below the required clearance, the distance is measured at further points of the
+segment. The measurements end when the bound is at least the required clearance, or when one of the points is too close.
 
 An obstacle that moves at a constant velocity ``v`` stands still in coordinates that move with it. If ``t v`` is
-subtracted from the position at each time t, the same proof is exact for a moving obstacle. The path must then be
-executed on time.
+subtracted from the position at each time t, the same bound holds for a moving obstacle. The path must then be executed
+at its planned times.
 
 An obstacle may have a margin that grows with time (:mod:`~imitarm.policies.prediction_margin`). The distance minus this
 margin is also a convex function. In this module, all distances to such an obstacle are distances minus its margin.
@@ -39,12 +38,12 @@ _MAX_PROBES = 12  # points measured on a segment whose bound is too low; the bra
 
 @dataclass(frozen=True, eq=False)
 class ClosePoints:
-    """Points of a path, between its samples, at which a sphere of the tool is closer to an obstacle than required.
+    """Points between the samples of a path at which a sphere of the tool is closer to an obstacle than required.
 
     At the samples before and after such a point, the sphere is not too close.
 
     Attributes:
-        pair: index of the pair of a sphere and an obstacle, shape (m,).
+        pair: index of the pair (a sphere and an obstacle) that is too close at each point, shape (m,).
         segment: index of the sample before the point, shape (m,).
         fraction: position of the point between the sample before it (0) and the sample after it (1), shape (m,).
     """
@@ -55,7 +54,7 @@ class ClosePoints:
 
     @classmethod
     def none(cls) -> ClosePoints:
-        """Return an empty set."""
+        """Return an object without points."""
         return cls(np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp), np.empty(0))
 
     def __len__(self) -> int:
@@ -68,21 +67,21 @@ class ClosePoints:
 
 @dataclass(frozen=True, eq=False)
 class ToolAmongObstacles:
-    """The spheres that contain the tool, and the obstacles that these spheres must not approach too closely.
+    """The spheres that contain the tool, and the obstacles from which these spheres keep a distance.
 
     One sphere and one obstacle form a *pair*: pair ``i`` is obstacle ``i // n_spheres`` with sphere
-    ``i % n_spheres``. The tool rotates in the same way as on the nominal path. At each sample, the centre of a sphere
-    is therefore the position of the tip plus a known offset.
+    ``i % n_spheres``. At each sample, the tool has the same rotation as on the nominal path. The centre of a sphere is
+    therefore the position of the tip plus a known offset.
 
     Attributes:
         obstacles: convex obstacles; a rotating obstacle is replaced by a sphere that contains it.
         spheres: centres in the tool's frame and radii, rows x y z r, shape (n_spheres, 4) [m].
         radii: radii of the spheres, shape (n_spheres,) [m].
-        offsets: for each obstacle, an array of shape (n_spheres, n, 3) [m], or None if all its vectors are zero. The
-            array contains the vector from the tip to the centre of each sphere at each sample, minus the obstacle's
+        offsets: for each obstacle, an array of shape (n_spheres, n, 3) [m], or None if all its vectors are zero. It
+            contains the vector from the tip to the centre of each sphere at each of n samples, minus the obstacle's
             displacement since time 0, in the base frame.
-        bows: largest deviation of each sphere's centre from a straight line, on each segment between two samples, shape
-            (n_spheres, n - 1) [m]. The rotation of the tool causes this deviation.
+        bows: largest distance of each sphere's centre from the straight line between its positions at two successive
+            samples, shape (n_spheres, n - 1) [m]. The centre leaves the line because the tool rotates.
         times: time of each sample, shape (n,) [s].
         margins: for each obstacle, its margin, or None for an obstacle without a margin.
     """
@@ -103,13 +102,13 @@ class ToolAmongObstacles:
         obstacles: Sequence[Obstacle],
         margins: Sequence[PredictionMargin | None] | None = None,
     ) -> ToolAmongObstacles:
-        """Place the spheres and the obstacles along a path.
+        """Compute the positions of the spheres relative to the tip and the obstacles along a path.
 
         Args:
-            nominal: times and rotations of the tool, n samples.
+            nominal: path with the times and rotations of the tool, n samples.
             spheres: centres in the tool's frame and radii, rows x y z r, shape (n_spheres, 4) [m].
-            obstacles: obstacles at time 0; obstacles with a velocity move from there. A rotating obstacle is replaced
-                by a sphere about its centre that contains it.
+            obstacles: obstacles at time 0, which keep their velocities. A rotating obstacle is replaced by a sphere
+                about its centre that contains it.
             margins: the margin of each obstacle, or None for an obstacle without a margin; None: there are no margins.
 
         Raises:
@@ -152,12 +151,12 @@ class ToolAmongObstacles:
         return len(self.radii) * len(self.obstacles)
 
     def centres(self, pair: int, positions: Array, samples: Index | slice = slice(None)) -> Array:
-        """Return positions of the centre of a pair's sphere, each relative to the obstacle's position at the same time.
+        """Return positions of the centre of a pair's sphere, relative to the obstacle's displacement since time 0.
 
         Args:
             pair: index of the pair.
             positions: positions of the tip, shape (..., m, 3) [m].
-            samples: the m samples of the path to which the positions belong.
+            samples: indices of the m samples of the path to which the positions belong.
 
         Returns:
             Shape (..., m, 3) [m].
@@ -167,7 +166,7 @@ class ToolAmongObstacles:
         return positions if offset is None else positions + offset[sphere, samples]
 
     def distance(self, pair: int, positions: Array, samples: Index | slice) -> Array:
-        """Return the distance (..., m) [m] of a pair; the arguments are those of :meth:`centres`."""
+        """Return the distance (..., m) [m] between sphere and obstacle of a pair; see :meth:`centres`."""
         obstacle, sphere = divmod(pair, self.n_spheres)
         centres = self.centres(pair, positions, samples)
         kept_off = self.radii[sphere] + self.margin(pair, samples)
@@ -215,23 +214,24 @@ class ToolAmongObstacles:
         tolerance: float,
         margin: Array | float = 0.0,
     ) -> Array:
-        """Return the distance that points must move along directions to leave the inflated obstacle.
+        """Return how far points must move along directions until they are at the distance ``target`` from the obstacle.
 
-        The inflated obstacle contains all points at which the pair's distance is below ``target``. A ray leaves the
-        inflated obstacle at its last crossing of the surface. Newton's method starts beyond this crossing. Because the
-        signed distance along a ray is convex, the computed displacement decreases towards the crossing and never falls
-        below it.
+        The *inflated obstacle* contains all points at which the pair's distance is below ``target``. Each point moves
+        along a ray until it leaves the inflated obstacle for the last time. Newton's method starts on the ray beyond
+        this exit. The signed distance along a ray is convex, so the computed displacement decreases towards the exit
+        and never passes it.
 
         Args:
             pair: index of the pair.
             points: positions of the centre of the pair's sphere, shape (p, 3) [m].
             directions: unit vectors, one for each row, shape (m, 3).
-            target: distance of the pair that the points must reach [m].
+            target: distance between sphere and obstacle that the points must reach [m].
             tolerance: largest accepted excess of the distance over ``target`` [m].
             margin: results of :meth:`margin` for the same points, shape (p,) [m].
 
         Returns:
-            Displacements along the directions, shape (m, p) [m]; inf where the ray never leaves the obstacle.
+            Displacements of the p points along the m directions, shape (m, p) [m]; inf if a point never reaches the
+            distance.
         """
         obstacle, sphere = divmod(pair, self.n_spheres)
         solid = self.obstacles[obstacle]
@@ -254,7 +254,7 @@ class ToolAmongObstacles:
         return lift
 
     def clearance_of(self, positions: Array) -> PathClearance:
-        """Return the distances and normals of every pair along a path of the tip (n, 3)."""
+        """Return the distances of all pairs along a path of the tip, whose positions have the shape (n, 3) [m]."""
         n, k = len(positions), self.n_spheres
         if k == 1 and len(self.obstacles) == 1 and self.offsets[0] is None and self.margins[0] is None:
             d, normals = self.obstacles[0].distances_at(positions, gradient=True)
@@ -273,7 +273,7 @@ class ToolAmongObstacles:
 
 @dataclass(frozen=True, eq=False)
 class PathClearance:
-    """Distances from the tool to the obstacles along one path of the tip, and bounds that follow from them.
+    """Distances from the tool to the obstacles along one path of the tip, and their lower bounds between the samples.
 
     Attributes:
         tool: the spheres and the obstacles.
@@ -295,11 +295,12 @@ class PathClearance:
     def segment_bounds(self) -> Array:
         """Bound the distance from below on each segment of the path.
 
-        Let ``f`` be a convex function on a segment of length L, with slope a at the start and b at the end. Then ``f(s)
-        >= max(f0 + a s, f1 - b (L - s))``. The minimum of this bound over s is at an end of the segment, or where the
-        two terms of the maximum are equal. The tip moves straight between two samples. If a sphere's centre is not at
-        the tip, a rotation of the tool by ``angle`` makes the centre deviate from the straight line by at most
-        ``|offset| (1 - cos(angle / 2))``. This largest deviation is subtracted from the bound of the distance.
+        Let ``f`` be a convex function on a segment of length L. It has the value f0 and the slope a at the start, and
+        the value f1 and the slope b at the end. Then ``f(s) >= max(f0 + a s, f1 - b (L - s))``. The minimum of this
+        bound over s is at an end of the segment, or where the two terms of the maximum are equal. Between two samples,
+        the tip moves along a straight line. If the tool rotates by ``angle`` at the same time, the centre of a sphere
+        deviates from a straight line by at most ``|offset| (1 - cos(angle / 2))``. This deviation is subtracted from
+        the bound.
 
         Returns:
             Shape (n_pairs, n - 1) [m].
@@ -323,13 +324,13 @@ class PathClearance:
         return low - (np.tile(tool.bows, (len(tool.obstacles), 1)) if tool.bows.any() else 0.0)
 
     def certified(self, clearance: float) -> tuple[Array, ClosePoints]:
-        """Bound the distance on each segment, and refine the bound where it is below a clearance.
+        """Bound the distance from below on each segment, and refine the bound where it is below ``clearance``.
 
         Near a corner of an obstacle, the bound from the tangents at the two ends of a segment is much too low. The
         distance is therefore measured at the point where the tangents cross. If this distance is below the clearance,
-        the path is really too close to the obstacle. Otherwise, the point replaces one end of the segment. It replaces
-        the first end if the distance still decreases at the point, and the last end if the distance increases. The
-        minimum of the distance therefore stays between the two ends, and the bound converges to this minimum.
+        the path is too close to the obstacle. Otherwise, the point replaces one end of the segment: the first end if
+        the distance decreases at the point, or the last end if it increases. The minimum of the distance therefore
+        stays between the two ends, and the bound converges to this minimum.
 
         Args:
             clearance: required clearance [m].
@@ -380,7 +381,7 @@ class PathClearance:
         return np.maximum(bounds, low - bow), at
 
     def at(self, points: ClosePoints) -> tuple[Array, Array]:
-        """Return distance (m,) [m] and normal (m, 3) at points between two samples."""
+        """Return the distances (m,) [m] and the obstacles' normals (m, 3) at points between the samples."""
         distance, normal = np.empty(len(points)), np.empty((len(points), 3))
         for i in np.unique(points.pair).tolist():
             of = np.flatnonzero(points.pair == i)
@@ -393,7 +394,7 @@ class PathClearance:
 
 
 def without_rotation(obstacle: Obstacle) -> Obstacle:
-    """Return the obstacle, or, if it rotates, a sphere about its centre that contains it in every orientation.
+    """Return the obstacle if it does not rotate; otherwise, a sphere about its centre that contains it.
 
     Raises:
         InputError: when a half-space rotates.
@@ -417,7 +418,7 @@ def crossing_of_tangents(f0: Array, a: Array, f1: Array, b: Array, length: Array
         a: slopes of the functions at the start.
         f1: values of the functions at the end.
         b: slopes of the functions at the end.
-        length: length of the interval.
+        length: length of the interval, in the unit of s.
     """
     inside = (a < 0.0) & (b > 0.0)
     s = np.minimum(np.maximum((f1 - f0 - b * length) / np.where(inside, a - b, -1.0), 0.0), length)

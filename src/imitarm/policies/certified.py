@@ -1,28 +1,27 @@
-"""Find the smallest displacement of components with which the whole path keeps its clearance, or refuse the scene.
+"""The default adaptation method: the smallest displacement of the components with which the path keeps its clearance.
 
 The algorithm of :func:`find_detour`:
 
-1. **Side.** Take the obstacle with the largest violation. Try directions across the path. Along each direction, the
-   lift of a violated sample is the distance by which the sample must move to leave the inflated convex obstacle.
-   Newton's method computes the lift from a starting point outside the obstacle. The signed distance is convex, so
-   Newton's method never overshoots. A small quadratic program computes the smallest displacements of the components
-   that give this lift. The search first follows the direction of least cost, until no sample violates the clearance.
-   The cost is the displacement relative to the demonstrated variance, plus the remaining violation. If this direction
-   fails, the other directions are tried later.
+1. **Side.** Take the obstacle that violates the clearance most, and try directions across the path. The *lift* of a
+   sample is how far the sample must move along a direction until it keeps the clearance. A small quadratic program
+   computes the smallest displacements of the components that give all samples their lift. The cost of a direction is
+   the displacement relative to the demonstrated variance, plus the violations that remain at other obstacles. The
+   search follows the direction of least cost until no sample violates the clearance. If this direction fails, the
+   search returns to other directions.
 2. **Least detour** (:mod:`~imitarm.policies.least_detour`): the smallest displacement that keeps the clearance and
    passes each obstacle on the chosen side.
 3. **Certificate** (:mod:`~imitarm.policies.certificate`): a lower bound of the distance on the whole path, not only at
    samples.
-4. If the search over sides finds no path, a grid of positions (:mod:`~imitarm.policies.passages`) often proves that
-   no path exists. Otherwise, a second search treats all samples together. The second search takes routes from a roadmap
-   (:mod:`~imitarm.policies.roadmap`), and follows each route first with the learned components, then with more,
-   narrower components. If components can move only in a plane, the grid and the roadmap are built earlier: as soon as
-   the next choice of sides costs more than 70 % of the previous choice. If they contain no route, the search over sides
-   ends. If no route of the roadmap leads to a path, a last attempt follows the cheapest chain of the grid's cells.
-5. The displacement may be more than twice the depth by which the learned path violates the clearance. In this case, the
-   learned components are too wide for the scene, or the chosen side is bad. A route of the roadmap is then followed
-   with narrower components. Of the two paths, the path with the smaller mean deviation from the demonstrations is
-   returned.
+4. If steps 1 to 3 find no path, a grid of positions (:mod:`~imitarm.policies.passages`) often proves that no path
+   exists. Otherwise, a roadmap (:mod:`~imitarm.policies.roadmap`) gives routes around the obstacles. Step 2 follows
+   each route, first with the learned components, then with more, narrower components. If no route leads to a path, step
+   2 follows the cheapest chain of the grid's cells. If components can move only in a plane, grid and roadmap are built
+   earlier: as soon as the next choice of sides costs more than 70 % of the previous choice. If there is no route, the
+   search over sides ends.
+5. The path of step 3 may be displaced by more than twice the depth by which the learned path violates the clearance.
+   Then, the learned components are too wide for the scene, or another side is better. In this case, step 2 also follows
+   a route of the roadmap with narrower components. The function returns the path with the smaller mean deviation from
+   the demonstrations.
 """
 
 from __future__ import annotations
@@ -78,7 +77,7 @@ _FEW_PAIRS = 4  # of spheres and obstacles: measuring all samples then takes les
 
 
 class CertifiedAdapter(PathAdapter):
-    """The default method: the least detour with a certified clearance, or a refusal."""
+    """The default method: the smallest detour with a guaranteed clearance, or a detour that is not feasible."""
 
     refuses = True
 
@@ -96,7 +95,7 @@ def find_detour(path: ComponentPath, nominal: PathClearance, clearance: float, a
     Args:
         path: the nominal path and its components.
         nominal: clearance along the nominal path.
-        clearance: required [m].
+        clearance: required clearance [m].
         allowed: directions in which components may move.
 
     Returns:

@@ -1,4 +1,4 @@
-"""CertifiedRCAMO: among moving obstacles, plan the rest of the motion again and again, each time with a certificate."""
+"""CertifiedRCAMO: plan the rest of the motion again and again among moving obstacles, with a guaranteed clearance."""
 
 from __future__ import annotations
 
@@ -52,64 +52,67 @@ class _Stopping:
 
 
 class CertifiedRCAMO(Policy):
-    r"""Re-plan the rest of the motion many times a second; follow only plans that are certified for the whole arm.
+    r"""Plan the rest of the motion many times a second, and follow only plans that guarantee the whole arm's clearance.
 
-    Each plan begins at the measured state of the arm. It uses the observed obstacles and their velocities. At each time
-    t of the plan, the distance of the whole arm to each predicted obstacle i is at least
+    Each plan begins at the measured state of the arm, and predicts the obstacles from their observed positions and
+    velocities. A plan is *certified* if the distance :math:`d_i(t)` of the whole arm from each predicted obstacle i is
+    proven to satisfy
 
     .. math:: d_i(t) \ge c + m_i(t)
 
     Here, c is the required clearance and :math:`m_i` is the margin for the error of the prediction
-    (:mod:`~imitarm.policies.prediction_margin`). If the path can't pass an obstacle in time, a plan may wait until the
-    obstacle has passed (:mod:`~imitarm.policies.retiming`). A plan becomes void as soon as one of its assumptions fails
-    (:mod:`~imitarm.policies.plan_in_execution`). The arm may be off schedule; or an obstacle may be new, or outside its
-    margin, and too close to the rest of the plan.
-    The policy then makes another plan at once. There are three cases:
+    (:mod:`~imitarm.policies.prediction_margin`). A plan may also wait until an obstacle has passed
+    (:mod:`~imitarm.policies.retiming`). A plan becomes void as soon as one of its assumptions fails
+    (:mod:`~imitarm.policies.plan_in_execution`). For example, the arm is late, or an obstacle is farther from its
+    prediction than its margin and too close to the rest of the plan. The policy then makes another plan at once. There
+    are three cases:
 
     1. If a certified plan exists, the arm follows this plan.
-    2. If no plan is certified, but braking to rest and waiting there is certified
+    2. If no plan is certified, but a motion that brakes and then waits is certified
        (:func:`~imitarm.policies.stopping.certified_stop`), the arm brakes and waits.
     3. If neither a plan nor a stop is certified, for example because an obstacle comes towards the arm,
        :class:`~imitarm.policies.rcamo.RCAMO` commands the arm. The arm then evades without a certificate.
 
-    If no plan is certified for longer than ``patience``, RCAMO commands the arm as well, and the search goes on.
+    If no plan has been certified for longer than ``patience``, RCAMO also commands the arm. In all cases, the search
+    for a plan continues.
 
-    Tracked obstacles are predicted with noise. The velocities of those that move steadily are therefore measured over
-    a longer time (:mod:`~imitarm.perception.steady_velocity`). If the rest of a plan is no longer clear of a tracked
-    obstacle, the plan stays valid while its next 1.5 s are clear.
+    The velocities of tracked obstacles are noisy. For obstacles that move steadily, the policy therefore uses their
+    mean velocities over a longer time (:mod:`~imitarm.perception.steady_velocity`). If a new prediction of a tracked
+    obstacle comes too close to a plan, the plan stays valid while its next 1.5 s keep the clearance.
 
-    In all cases the status and its reason name the obstacle, and the arm resumes as soon as a plan is certified. A
-    :class:`~imitarm.safety.SafetyFilter` should check every command, as for all policies. If obstacles at rest make the
-    motion impossible, ``reset`` refuses to start. If a moving obstacle makes the motion impossible, the arm waits.
+    The status of each command names the obstacle in its reason. As soon as a plan is certified, the motion continues.
+    As with all policies, let a :class:`~imitarm.safety.SafetyFilter` check every command. If obstacles at rest make the
+    motion impossible, ``reset`` raises an error. If only a moving obstacle makes the motion impossible, the arm waits.
 
-    In a simulation, ``step`` computes the plan while the simulated time stands still. A real system computes the plan
-    in another process, and uses it as soon as it is ready. Set ``planning_time`` to the time that this takes. A plan
-    then begins at the state that is predicted for the end of this time, and takes effect then.
+    In a simulation, the time stands still while ``step`` computes a plan. On a real arm, the computation takes time;
+    set ``planning_time`` to this time. Each plan then begins at the end of this time, at the state that is predicted
+    for then.
 
     Args:
         skill: skill to reproduce.
         rate: number of plans per second [Hz].
-        margin: a ``CoverageMargin``, which bounds the error of the predicted obstacle positions; None: predictions are
-            exact.
-        margin_horizon: the margin grows until this time after the obstacle was seen [s]; None: it grows without end.
-            Choose a time that covers the next plans and the braking.
-        planning_time: time from an observation until the plan made from it takes effect [s].
+        margin: a ``CoverageMargin``, which bounds the error of the predicted obstacle positions; None: predictions
+            count as exact.
+        margin_horizon: time after the last detection of an obstacle at which the margin stops to grow [s]; None: never.
+            Choose a time that covers the next few plans and the braking.
+        planning_time: time from an observation until the arm follows the plan that was made from this observation [s].
         max_tilt: see :func:`~imitarm.policies.adapt`.
         goal_tilt: see :func:`~imitarm.policies.adapt`.
         pinned: see :func:`~imitarm.policies.adapt`.
-        allowance: additional clearance for tracking errors [m], used if a plan with this larger clearance is found.
-        hold: a plan must keep its clearances at the goal for this long after the arrival [s]; a stop must keep them for
-            this long, too.
+        allowance: additional clearance for tracking errors [m]. If no plan has this additional clearance, the policy
+            plans without it.
+        hold: time for which a plan must keep its clearances at the goal after the arrival, and a stop must keep them at
+            rest [s].
         gain: feedback gain of the joint positions [1/s].
-        arrival: the motion has arrived when the tool is nearer than this to the goal [m].
-        max_rounds: largest number of rounds of one search while the arm moves, which limits the computing time; the
-            next search goes on where this one ended. See :func:`~imitarm.policies.replan`. None: no limit.
+        arrival: distance from the goal below which the tool has arrived [m].
+        max_rounds: largest number of rounds of one search for a plan, which limits the computing time. The next search
+            continues with the result of this one. See :func:`~imitarm.policies.replan`. None: no limit.
         patience: time without a certified plan after which RCAMO commands the arm instead of waiting [s].
         options: arguments of :class:`~imitarm.policies.Policy`; ``arm`` is required.
 
     Attributes:
-        plans: number of plans that were tried since ``reset``.
-        certified: number of these plans that were certified.
+        plans: number of searches for a plan since ``reset``.
+        certified: number of these searches that found a certified plan.
     """
 
     def __init__(
@@ -171,8 +174,8 @@ class CertifiedRCAMO(Policy):
         """Plan the whole motion from the measured posture.
 
         Raises:
-            InfeasibleError: when the motion is impossible because of standing obstacles, or because the arm can't do
-                it; the message says why.
+            InfeasibleError: when obstacles at rest or the limits of the arm make the motion impossible; the message
+                gives the reason.
         """
         self.plans = self.certified = 0
         self._goal = observation.scene.goal
@@ -227,7 +230,7 @@ class CertifiedRCAMO(Policy):
     # ----- each step
 
     def step(self, observation: Observation, dt: float) -> Command:
-        """Return the command that follows the certified plan, or brakes, or evades.
+        """Return the command that follows the certified plan, brakes, or evades without a guarantee.
 
         Raises:
             InputError: when ``reset`` was not called, or the goal has moved.
@@ -419,5 +422,5 @@ class CertifiedRCAMO(Policy):
 
 
 def replace_obstacles(scene: Scene, obstacles: Any) -> Scene:
-    """Return a scene with other obstacles."""
+    """Return the scene with ``obstacles`` instead of its own obstacles."""
     return Scene(scene.goal, obstacles, scene.stamp, scene.fixtures)

@@ -1,4 +1,4 @@
-"""A learned path as a sum of Gaussian components, so that an adaptation moves only some of them."""
+"""ComponentPath: a learned path with its Gaussian components, so that an adaptation can move only some of them."""
 
 from __future__ import annotations
 
@@ -42,31 +42,31 @@ def quintic_step(u: ArrayLike) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class ComponentPath:
-    r"""The nominal path, and the effect of moving its components.
+    r"""The nominal path, and how it changes when its components are displaced.
 
-    Time-driven GMR gives ``x0(t) = sum_k h_k(t) m_k(t)`` (thesis Eq 2.6 with its responsibilities). The
-    responsibilities ``h_k(t)`` depend only on time. Therefore, if the mean of each component ``k`` is moved by
-    ``Delta_k``, the path changes smoothly, and the change is linear in the ``Delta_k``::
+    Gaussian mixture regression (GMR) over time gives ``x0(t) = sum_k h_k(t) m_k(t)`` (thesis Eq 2.6). The
+    responsibilities ``h_k(t)`` depend only on time. If the mean of each component ``k`` is displaced by ``Delta_k``,
+    the change of the path is therefore linear in the ``Delta_k``::
 
         x(t) = x0(t) + w(t) sum_k h_k(t) Delta_k  =  x0(t) + basis(t) @ Delta
 
-    The window ``w`` is a quintic step. The window is 0 at every fixed time (start, goal, contact points) and 1
-    elsewhere. Components with ``Delta_k = 0`` have no effect.
+    The window ``w`` is 0 at the start, at the goal and at the pinned times, for example contacts. It rises to 1 on both
+    sides of these times as a quintic step.
 
     Attributes:
         nominal: the path without obstacles, n samples.
-        fixed_times: times at which the path must not be displaced [s]: the start, the pinned times and the goal.
-        responsibilities: h, shape (n, n_components).
-        basis: products of the window w and the responsibilities h, at least 0, shape (n, n_components).
+        fixed_times: times of the start, of the pinned points and of the goal, at which the path is not displaced [s].
+        responsibilities: responsibilities h_k at the samples, shape (n, n_components).
+        basis: products of the window w and the responsibilities h_k at the samples, shape (n, n_components).
         means: centres of the components on the nominal path, shape (n_components, 3) [m].
         covariances: position covariances of the components, with the lower bound (5 mm)^2, (n_components, 3, 3) [m^2].
-            The covariances also include the motion itself, so a component is elongated along the path.
-        yields: GMR's covariance at the time of each component's centre, with the same lower bound as ``covariances``,
-            (n_components, 3, 3) [m^2]. The size of a displacement is measured relative to this covariance.
+            A component is elongated along the path, because its covariance includes the motion along the path.
+        yields: covariance from GMR at the time of each component's centre, with the same lower bound, (n_components, 3,
+            3) [m^2]. The cost of a displacement is relative to this covariance.
         centres: index of the sample at the centre of each component, (n_components,).
         precisions: inverses of ``yields``, (n_components, 3, 3) [1/m^2].
-        tolerance: GMR covariance along the path, shape (n, 3, 3) [m^2].
-        rotation_tolerance: two standard deviations of the demonstrated rotation along the path, about the axis of
+        tolerance: covariance of the demonstrated positions from GMR, at the samples, shape (n, 3, 3) [m^2].
+        rotation_tolerance: two standard deviations of the demonstrated rotation at the samples, about the axis with the
             largest variation, shape (n,) [rad]; 0 if no orientation was learned.
     """
 
@@ -96,12 +96,12 @@ class ComponentPath:
 
         Args:
             skill: a fitted skill.
-            n_samples: samples along the path.
+            n_samples: number of samples along the path.
             start: start of the motion; None: the learned start.
-            goal: end of the motion; None: the learned goal. Another start or goal changes the nominal path
-                (``Skill.nominal``), and the components move with it.
-            pinned: further times [s] at which the path must not move, for example a contact; a sample is placed at
-                each of them.
+            goal: end of the motion; None: the learned goal. For another start or goal, the skill changes the nominal
+                path (``Skill.nominal``), and the components move with this path.
+            pinned: further times [s] at which the path is not displaced, for example at a contact. There is a sample at
+                each of these times.
 
         Raises:
             InputError: when there are fewer than 10 or more than 100 000 samples, or a pinned time is outside the
@@ -118,7 +118,7 @@ class ComponentPath:
         return _learned(skill.gmr_, n_samples, (0.0, *pins, duration)).between(skill, start, goal)
 
     def between(self, skill: Skill, start: Pose | None, goal: Pose | None) -> ComponentPath:
-        """Return this decomposed path of ``skill``, moved to another start or goal.
+        """Return this path, moved to another start or goal.
 
         Args:
             skill: the skill whose path was decomposed.
@@ -153,7 +153,7 @@ class ComponentPath:
 
     @cached_property
     def at_pins(self) -> Array:
-        """A factor that is 0 at every pinned time and 1 far from them, shape (n,)."""
+        """A factor for each sample that is 0 at every pinned time and 1 far from the pinned times, shape (n,)."""
         pins = self.fixed_times[1:-1]
         return _window(self.nominal.times, pins, PIN_WIDTH) if pins else np.ones(len(self.nominal))
 
@@ -167,7 +167,7 @@ class ComponentPath:
         return float(np.sqrt(squares.max(initial=0.0)))
 
     def jerk(self, values: Array) -> Array:
-        """Return the third derivative of values (n, m) at the samples, as six times the third divided differences.
+        """Return the third time derivative of the values (n, m) at the samples, from third divided differences.
 
         Returns:
             Shape (n - 3, m).
@@ -198,12 +198,12 @@ class ComponentPath:
 
     @cached_property
     def divided(self) -> ComponentPath:
-        """The same path with more, narrower components."""
+        """The same path with more, narrower components (cubic B-splines)."""
         return self._divided(_PIECES)
 
     @cached_property
     def finely_divided(self) -> ComponentPath:
-        """The same path with still narrower components, for sharp bends."""
+        """The same path with about 48 components (cubic B-splines), which allow sharp bends."""
         return self._divided(_FINE_PIECES)
 
     def _divided(self, n_pieces: int) -> ComponentPath:

@@ -1,4 +1,4 @@
-"""Clear postures at the goal: the tool is at a given pose, and the whole arm keeps its clearances."""
+"""Goal postures: search for postures with the tool at the goal in which the whole arm keeps its clearances."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ _TILTS = np.concatenate([np.eye(3), -np.eye(3)])
 
 @dataclass(frozen=True, eq=False)
 class GoalPosture:
-    """A posture with the tool at the goal.
+    """A posture of the arm with the tool at the goal.
 
     Attributes:
         joints: joint positions, shape (n_joints,) [rad].
-        tilt: rotation of the tool in this posture away from its learned rotation at the goal, as a rotation vector in
-            the base frame, shape (3,) [rad].
+        tilt: rotation vector from the learned rotation of the tool at the goal to its rotation in this posture, in the
+            base frame, shape (3,) [rad].
     """
 
     joints: Array
@@ -47,7 +47,7 @@ class GoalSearch:
     """The result of a search for clear postures at the goal.
 
     Attributes:
-        found: different clear postures; the posture nearest to the start of the motion is the first.
+        found: clear postures in the order of their distance from the start posture of the motion.
         best: the largest clearance among all postures at the goal; None if the arm can't reach the goal.
     """
 
@@ -58,14 +58,14 @@ class GoalSearch:
 def clear_postures(around: ArmAmongObstacles, goal: Pose, time: float, start: Array, goal_tilt: float) -> GoalSearch:
     """Search for postures in which the tool is at the goal and the whole arm is clear.
 
-    Inverse kinematics from random starts finds postures at the goal. Each posture is then varied by the self-motion of
-    the arm, which does not move the tool. If no posture is clear and ``goal_tilt`` is positive, the search is repeated
-    with a tilted tool.
+    Inverse kinematics from random starts finds postures at the goal. The self-motion of the arm, which does not move
+    the tool, leads from each of these postures to further postures. If no posture is clear and ``goal_tilt`` is
+    positive, the search is repeated with the tool rotated by up to ``goal_tilt``.
 
     Args:
         around: the arm, its obstacles and the required clearances.
         goal: learned pose of the tool at the goal, tool_to_base.
-        time: time at which the arm is at the goal [s]; moving obstacles are predicted for this time.
+        time: time at which the arm is at the goal [s]; it determines the positions of moving obstacles.
         start: posture at the start of the motion, shape (n_joints,) [rad].
         goal_tilt: largest rotation of the tool away from its learned rotation at the goal [rad].
     """

@@ -1,4 +1,4 @@
-"""The directions into which a path may be displaced, in a frame that follows the motion."""
+"""Directions in which a path may be displaced, in a frame whose first axis points along the motion."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ def allowed_axes(forbidden: Array) -> tuple[Array, Array]:
     """Return the space in which a path may be displaced.
 
     Args:
-        forbidden: directions in which the path must not be displaced, unit rows (m, 3).
+        forbidden: directions in which the path must not be displaced, unit vectors, shape (m, 3).
 
     Returns:
-        An orthonormal basis of the d directions that are permitted at least one way, as columns, shape (3, d); and the
-        directions that are forbidden only one way, in this basis, shape (m', d).
+        An orthonormal basis of the space in which the path may be displaced, as d columns, shape (3, d); and the
+        forbidden directions whose opposites are allowed, in this basis, shape (m', d).
     """
     both = np.any(forbidden @ forbidden.T < -1.0 + 1e-9, axis=1)
     _, size, basis = np.linalg.svd(np.concatenate([np.zeros((1, 3)), forbidden[both]]))
@@ -30,10 +30,10 @@ def allowed_axes(forbidden: Array) -> tuple[Array, Array]:
 
 
 def headings(axes: Array) -> Array:
-    """Return unit vectors of coordinates in the frame of :func:`frame`: 26 in space, 12 in a plane, 2 on a line.
+    """Return candidate directions, in the frame of :func:`frame`: 26 in space, 12 in a plane, 2 on a line.
 
     Args:
-        axes: orthonormal basis of the directions in which the tool may deviate, as columns, shape (3, d).
+        axes: orthonormal basis of the space in which the tool may deviate, as d columns, shape (3, d).
     """
     d = axes.shape[1]
     if d == 2:
@@ -45,10 +45,10 @@ def headings(axes: Array) -> Array:
 
 
 def frame(tangent: Array, axes: Array) -> Array:
-    """Return an orthonormal frame (3, d) of the directions ``axes`` (3, d): along the motion, to its left, and up.
+    """Return an orthonormal basis (3, d) of the space of ``axes`` (3, d): along the motion, to its left, and up.
 
-    The frame depends only on the motion and the vertical. If a scene is rotated about the vertical, or mirrored, the
-    candidates are rotated or mirrored in the same way.
+    The frame depends only on the direction of the motion and on the vertical. If a scene is rotated about the vertical,
+    the candidate directions are therefore rotated in the same way.
     """
     if axes.shape[1] == 3:
         return _frame_in_space(*tangent.tolist())

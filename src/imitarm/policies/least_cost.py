@@ -1,4 +1,4 @@
-"""The direction of least cost: candidates for the coupling acceleration of a primitive, and their predicted cost."""
+"""LeastCost: the choice of RCAMO among candidates for the coupling acceleration and the speed of the motion."""
 
 from __future__ import annotations
 
@@ -23,22 +23,23 @@ _TIED = 1e-13  # costs that differ by less are equal: it is above the rounding o
 
 
 class Response(NamedTuple):
-    r"""How a deviation from the motion of a primitive changes over time under a constant coupling acceleration.
+    r"""The response of a motion primitive to a constant coupling acceleration.
 
-    Let x be the position of the tool, xi the position on the motion primitive, and u the coupling acceleration. The
-    force of the primitive depends only on the phase, so the deviation e = x - xi obeys a linear equation:
+    Let xi be the position that the primitive would have without coupling, x the position of the tool, and u the
+    coupling acceleration. The forcing term of the primitive depends only on the phase. The deviation e = x - xi
+    therefore obeys a linear equation:
 
     .. math::
         \tau^2 \ddot e + D \tau \dot e + K e = \tau^2 u, \qquad
         e(t) = A(t)\,e_0 + B(t)\,\dot e_0 + G(t)\,u, \qquad G = \frac{\tau^2}{K} (1 - A)
 
     Let l_1 and l_2 be the roots of ``tau^2 l^2 + D tau l + K = 0``. Then ``A = (l_1 exp(l_2 t) - l_2 exp(l_1 t)) / (l_1
-    - l_2)`` and ``B = (exp(l_1 t) - exp(l_2 t)) / (l_1 - l_2)``. Without u, the deviation decays to 0, so the tool
-      returns to the path.
+    - l_2)`` and ``B = (exp(l_1 t) - exp(l_2 t)) / (l_1 - l_2)``. If u is 0, the deviation decays to 0, so the tool
+    returns to the path.
 
     Attributes:
-        A: factor of the initial deviation, shape (k,).
-        B: factor of the initial velocity of the deviation, shape (k,) [s].
+        A: factor of the initial deviation e_0 at k times, shape (k,).
+        B: factor of the initial rate of the deviation, shape (k,) [s].
         G: factor of the coupling acceleration, shape (k,) [s^2].
         a_rate: derivative of A, shape (k,) [1/s].
         b_rate: derivative of B, shape (k,).
@@ -73,11 +74,11 @@ class Response(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """The motion without coupling at the H instants of the horizon, for R speeds of the phase.
+    """The predicted motion without coupling, at H times of the horizon and for R speeds of the phase.
 
     Attributes:
         centers: centres of the tool's spheres without coupling, shape (R, H, S, 3) [m].
-        arrived: whether the phase is at its end, shape (R, H).
+        arrived: whether the phase has reached the end of the motion, shape (R, H).
         goal: centres of the tool's spheres at the goal, shape (S, 3) [m].
     """
 
@@ -93,8 +94,8 @@ class Choice(NamedTuple):
         scaled: coupling acceleration u / u_max, shape (3,).
         rate: speed of the phase; 1 is the learned speed.
         cost: predicted cost of this candidate.
-        nearest: index of the obstacle that comes nearest; -1 if none is near.
-        gap: distance of the tool to this obstacle, minus the margin [m].
+        nearest: index of the obstacle that comes nearest to the tool; -1 if no obstacle is near.
+        gap: smallest distance of the tool to this obstacle, minus the margin of its prediction [m].
     """
 
     scaled: Array
@@ -114,37 +115,39 @@ class LeastCost:
 
     .. math::
         J(u, r) = \sum_{m=1}^{H} \gamma^m \left[ \tfrac12 w_e\, e_m^T \Theta e_m + \sum_i b_i(\xi_m + e_m, m) \right]
-        + w_\Delta \|\hat u - \hat u_{prev}\|^2 + w_u \|\hat u\|^2 + w_r (1 - r)^2, \qquad \hat u = u / a_{max}
+        + w_\Delta \|\hat u - \hat u_{prev}\|^2 + w_u \|\hat u\|^2 + w_r (1 - r)^2, \qquad \hat u = u / u_{max}
 
-    The symbols are explained under Attributes. The formula corrects thesis Eq 5.5 in three points. It sums a task cost
-    of the deviations e, where the thesis has the trajectory itself. The cost b of an obstacle decreases with the
-    distance. Both costs are summed over a horizon of H instants. Theta is the precision at the current phase. The
-    candidates for u are 0 and three sizes of u in each heading. The candidates for r are the speeds in ``rates``, which
-    include waiting (r = 0) and going back (r < 0).
+    The formula corrects thesis Eq 5.5 in three points. The task cost depends on the deviations e, where the thesis has
+    the trajectory itself. The cost b of an obstacle decreases with the distance. Both costs are summed over a horizon
+    of H times, where e_m is the deviation at the m-th time. Theta is the precision (inverse covariance) of the
+    demonstrations at the current phase. The candidates for u are 0 and, in each direction of ``units``, the three
+    ``sizes``. The candidates for r are the ``rates``, which include waiting (r = 0) and going back (r < 0). The
+    attributes explain the other symbols.
 
-    The search finds the least cost of all candidates at all speeds, but computes only few distances. Two facts make
-    this possible: a candidate costs at least as much as it would without obstacles, and an obstacle has no cost at an
-    instant before the tool can reach it.
+    The search finds the least cost of all candidates, but computes only few distances. Two facts make this possible. A
+    candidate costs at least as much as it would cost without obstacles. An obstacle has no cost at times before the
+    tool can reach it.
 
-    The cost of an obstacle falls gradually, so an obstacle beside the goal would keep the tool away from the goal.
-    Therefore, after the end of the phase, b is reduced by its value at the goal, provided that the goal keeps the
-    clearance.
+    The cost of an obstacle decreases gradually with the distance, so an obstacle beside the goal would keep the tool
+    away from the goal. Therefore, if the goal keeps the clearance, b is reduced by its value at the goal after the end
+    of the phase.
 
     Attributes:
-        times: instants of the horizon, shape (H,) [s].
+        times: times of the horizon, from now, shape (H,) [s].
         gains: stiffness and damping of the deviation.
         time_constant: tau, the time constant of the deviation [s].
         obstacle_cost: b, the cost of being near an obstacle.
         max_push: u_max, the largest coupling acceleration [m/s^2].
-        units: headings in the frame of :func:`~imitarm.policies.headings.frame`, shape (k, d).
+        units: candidate directions of u, unit vectors in the frame of :func:`~imitarm.policies.headings.frame`, shape
+            (k, d).
         max_acceleration: largest acceleration of the deviation by u, spring and damper together [m/s^2].
-        discount: gamma, the factor by which the weight decreases from one instant to the next.
+        discount: gamma, the factor by which the weight decreases from one time of the horizon to the next.
         deviation_weight: w_e, weight of the deviation [1/m^2].
         change_weight: w_Delta, weight of a change of u since the last step.
         size_weight: w_u, weight of the size of u.
         wait_weight: w_r, weight of the difference between r and the learned speed 1.
-        rates: speeds of the phase that are candidates; the first speed is 1.
-        sizes: sizes of u, as fractions of u_max.
+        rates: candidates for the speed r of the phase; the first is 1, the learned speed.
+        sizes: candidates for the norm of u, as fractions of u_max.
     """
 
     times: Array
@@ -164,7 +167,7 @@ class LeastCost:
 
     @cached_property
     def response(self) -> Response:
-        """Deviation at the instants of the horizon."""
+        """Response of the deviation to u, at the times of the horizon."""
         return Response.of(self.gains, self.time_constant, self.times)
 
     @cached_property
@@ -202,7 +205,7 @@ class LeastCost:
             spheres: centres of the tool's spheres relative to its tip, shape (S, 3) [m].
             one_sided: directions along which u must have no positive component, shape (m, 3).
             tool_radius: largest distance of the tool's surface from its tip [m].
-            numbers: the last fields: ``rate_time`` [s], ``beta``, ``cap`` [m].
+            numbers: values of the last three fields of the structure: ``rate_time`` [s], ``beta``, ``cap`` [m].
         """
         cost, response, (task, pull, curvature) = self.obstacle_cost, self.response, self._task
         assert isinstance(cost, DistanceCost)
@@ -233,7 +236,7 @@ class LeastCost:
         return float(self._gains[-1])
 
     def smooth_costs(self, scaled: Array, sizes: Array, previous: Array, free: Array, precision: Array) -> Array:
-        """Return the costs of C candidates, without the costs of obstacles and of waiting, shape (C,).
+        """Return the costs of C candidates, except for the costs of obstacles and of the speed r, shape (C,).
 
         The task cost is a quadratic form in u, so the deviations of the candidates are not needed.
 
@@ -266,19 +269,19 @@ class LeastCost:
     ) -> Choice:
         """Return the candidate of least cost.
 
-        A candidate that would accelerate the deviation by more than ``max_acceleration`` is moved towards ``pull``
-        until its acceleration is ``max_acceleration``.
+        If a candidate u would accelerate the deviation by more than ``max_acceleration``, it is moved towards ``pull``
+        until the acceleration ``u - pull`` has this size.
 
         Args:
-            axes: frame of the motion, shape (3, d).
+            axes: frame of the motion (:func:`~imitarm.policies.headings.frame`), shape (3, d).
             one_sided: directions along which u must have no positive component, shape (m, 3).
             previous: u / u_max of the last choice, shape (3,).
             free: deviations without coupling, shape (H, 3) [m].
             precision: Theta at the current phase, shape (3, 3).
-            predict: function that takes speeds of the phase (R,) and returns the motion without coupling.
+            predict: function that gets speeds of the phase (R,) and returns the predicted motion without coupling.
             obstacles: the obstacles that may come near.
-            pull: acceleration ``(D e' / tau + K e / tau^2)`` of spring and damper, against the deviation, shape (3,)
-                [m/s^2]; None: without limit.
+            pull: acceleration ``D e' / tau + K e / tau^2`` with which spring and damper reduce the deviation, shape
+                (3,) [m/s^2]; None: the acceleration is not limited.
         """
         scaled, sizes = self._candidates
         scaled = scaled @ axes.T

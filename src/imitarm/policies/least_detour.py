@@ -1,10 +1,11 @@
-"""The smallest displacement of components that keeps the clearance and passes each obstacle on a given side.
+"""LeastDetour: the smallest displacement of components that keeps the clearance and passes obstacles on given sides.
 
-A tangent plane for each sample and obstacle turns the required clearance into linear inequalities in the displacements
-``Delta_k`` of the components. The planes never overestimate the distance, so each solution keeps the clearance at the
-samples (an inner convex approximation). The method alternates two steps: it minimises ``sum_k Delta_k^T Y_k^-1
-Delta_k`` under these inequalities, then computes new planes. ``Y_k`` is the demonstrated covariance of component k.
-Each solution also satisfies the inequalities of the new planes, so the cost never increases.
+At each sample of the path, the distance to an obstacle is replaced by its tangent plane. The required clearance then
+becomes a linear inequality in the displacements ``Delta_k`` of the components. The tangent planes never overestimate
+the distance, so each solution keeps the clearance at the samples. The method alternates two steps. It minimises ``sum_k
+Delta_k^T Y_k^-1 Delta_k`` under these inequalities, where ``Y_k`` is the demonstrated covariance of component k. Then
+it computes new tangent planes at the solution. Each solution also satisfies the inequalities of the new planes, so the
+cost never increases.
 """
 
 from __future__ import annotations
@@ -51,11 +52,11 @@ def least_norm(rows: Array, lower: Array, upper: Array) -> Array | None:
 
     Args:
         rows: coefficients of the inequalities, shape (m, n).
-        lower: lower bounds, shape (m,), or (n + m,) when the first n entries bound y itself.
+        lower: lower bounds of the m rows, shape (m,); with shape (n + m,), the first n entries are bounds of y itself.
         upper: upper bounds, of the same shape as ``lower``.
 
     Returns:
-        y, shape (n,); None when there is no solution.
+        The vector y, shape (n,); None when there is no solution.
     """
     n = rows.shape[1]
     y, _, flag, _ = daqp.solve(np.eye(n), np.zeros(n), np.ascontiguousarray(rows), upper, lower)
@@ -67,10 +68,11 @@ class AllowedDirections:
     """The directions in which components may move: all ``u`` with ``u . f <= 0`` for every forbidden direction ``f``.
 
     Attributes:
-        forbidden: forbidden directions, one unit vector per row, shape (m, 3). Forbidding a direction and its opposite
-            forbids the whole axis.
+        forbidden: forbidden directions, one unit vector per row, shape (m, 3). If a direction and its opposite are both
+            forbidden, this axis is forbidden.
         axes: orthonormal basis of the space without the forbidden axes, as columns, shape (3, d).
-        one_sided: directions that are forbidden only one way, as unit vectors in the basis ``axes``, shape (m', d).
+        one_sided: forbidden directions whose opposites are allowed, as unit vectors in the basis ``axes``, shape (m',
+            d).
     """
 
     forbidden: Array
@@ -101,9 +103,9 @@ class AllowedDirections:
         return self.axes.shape[1]
 
     def enforced(self, reduced: Array) -> Array:
-        """Return the displacements (..., 3) that have the coordinates (..., d) in the basis ``axes``.
+        """Return displacements (..., 3) without forbidden components, from coordinates (..., d) in the basis ``axes``.
 
-        Because of rounding errors, a small component may remain in forbidden directions.
+        A component as small as the rounding errors may remain in a forbidden direction.
         """
         for _ in range(100 if len(self.one_sided) else 0):  # taking out one part may bring back a little of another
             for f in self.one_sided:
@@ -113,14 +115,11 @@ class AllowedDirections:
         return np.asarray(reduced @ self.axes.T)
 
     def projected(self, vectors: Array) -> Array:
-        """Return vectors (..., 3) without their components along axes on which the path must not be displaced."""
+        """Return vectors (..., 3) without their components along forbidden axes."""
         return vectors @ self.axes @ self.axes.T
 
     def unit_directions(self, candidates: Array) -> Array:
-        """Return the allowed part of each direction (m, 3), scaled to length 1, one row for each direction.
-
-        A direction is left out if its allowed part is short.
-        """
+        """Return candidate directions (m, 3) without their forbidden components, scaled to length 1."""
         allowed = self.enforced(candidates @ self.axes) if len(self.forbidden) else candidates
         length = np.sqrt(np.einsum("md,md->m", allowed, allowed))
         allowed = allowed[length > 0.25] / length[length > 0.25, None]
@@ -156,14 +155,14 @@ def _complement(axes: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Detour:
-    """A displaced path and its certificate.
+    """A displaced path with its guaranteed clearance.
 
     Attributes:
         path: the path and the components that were moved.
         displacement: displacement of each component's mean, shape (n_components, 3) [m].
-        clearance: distances along the displaced path.
+        clearance: distances to the obstacles along the displaced path.
         bounds: guaranteed lower bound of the clearance of each pair over the whole path, shape (n_pairs,) [m].
-        feasible: whether every bound reaches the required clearance and the path is within ``MAX_DISPLACEMENT`` and
+        feasible: whether every bound is at least the required clearance and the path is within ``MAX_DISPLACEMENT`` and
             ``MAX_STEP_RATIO``.
         out_of_limits: whether the path exceeds ``MAX_DISPLACEMENT`` or ``MAX_STEP_RATIO``.
         close: points of the path that are too close to an obstacle, although the neighbouring samples keep the
@@ -180,7 +179,7 @@ class Detour:
 
     @property
     def lowest(self) -> float:
-        """The smallest of all bounds [m]; inf without obstacles."""
+        """Guaranteed lower bound of the clearance of all pairs [m]; inf without obstacles."""
         return float(self.bounds.min(initial=np.inf))
 
 
@@ -217,8 +216,9 @@ class LeastDetour:
     """Finds the least detours of one path among one set of obstacles, for all spheres of the tool.
 
     Attributes:
-        target: planned distance at the samples: the clearance plus a small amount for the segments between them [m].
-        movable: whether a component can move the sample, for each sample, shape (n,).
+        target: distance from obstacles that is planned at the samples [m]: the clearance, plus a small addition for the
+            segments between the samples.
+        movable: whether a displacement of components can move each sample, shape (n,).
     """
 
     def __init__(
@@ -253,7 +253,7 @@ class LeastDetour:
         return _Cuts(np.concatenate([basis[j], basis[k + 1] - basis[k]]), direction, bound)
 
     def evaluate(self, displacement: Array, clearance: PathClearance) -> Detour:
-        """Return the certificate of a displaced path, and whether its displacement and steps are within the limits."""
+        """Return the displaced path with its guaranteed clearance, and whether it is within the limits."""
         bounds, close = clearance.certified(self.clearance)
         away = clearance.positions - self.path.nominal.positions
         out = bool(np.sqrt(np.einsum("nd,nd->n", away, away).max()) > MAX_DISPLACEMENT) or (
@@ -266,21 +266,22 @@ class LeastDetour:
     def shrink(
         self, start: PathClearance, moved: Index | None = None, *, smoothness: float | None = None
     ) -> Detour | None:
-        """Return the least detour that satisfies the tangent inequalities; the first tangents are those of ``start``.
+        """Return the least detour that passes each obstacle on the same side as the path of ``start``.
 
-        If no attempt is feasible, the best attempt is returned; None if there was no attempt.
+        The first tangents are those of ``start``. If no detour is feasible, the method returns the best one that it
+        found, or None if it found none.
 
-        If a segment is too close to an obstacle although the samples at its ends are not, the closest point of the
-        segment gives an additional inequality. A larger required clearance at the samples would not help, for two
-        reasons. First, if a path around an edge moves its samples away from the edge, its steps become longer, and a
-        step may still cut the edge. Second, near a time at which the path is fixed, components can hardly move samples.
-        A little more distance there needs very large displacements of the components.
+        A segment may be too close to an obstacle although the samples at its ends keep the clearance. The closest point
+        of such a segment gives an additional inequality. A larger required clearance at the samples would not help, for
+        two reasons. First, near an edge of an obstacle, samples farther from the edge have longer steps between them,
+        and a step may still cut the edge. Second, near the start, the goal and the pinned times, components hardly move
+        the samples. A little more distance there would need very large displacements.
 
         Args:
-            start: clearance along the path at which the first tangents are taken. No displacement of the components
-                needs to produce this path.
+            start: distances along the path at which the first tangents are computed. This can be any path; components
+                need not be able to produce it.
             moved: indices of the components that may move; None: all.
-            smoothness: weight of the squared jerk; None: the default weight of this path.
+            smoothness: weight of the squared jerk of the displacement; None: 0.001 if ``exact``, otherwise 0.
         """
         moved = np.arange(self.path.n_components) if moved is None else moved
         scale = self._scale(moved, smoothness)
@@ -317,7 +318,7 @@ class LeastDetour:
         return best
 
     def smoothed(self, detour: Detour) -> tuple[Detour, float]:
-        """Smooth the detour as far as possible if its jerk exceeds the limit; return the detour and its jerk ratio."""
+        """If the jerk of a detour exceeds its limit, smooth the detour; return the detour and its jerk ratio."""
         ratio = self.path.jerk_ratio(detour.clearance.positions)
         best, limit = detour, max(MAX_JERK_RATIO, 1.0)
         moved = np.flatnonzero(detour.displacement.any(axis=1)) if not self.exact else None
@@ -404,14 +405,14 @@ class LeastDetour:
 def style_scale(path: ComponentPath, allowed: AllowedDirections, moved: Index, smoothness: float) -> Array:
     """Return the matrix G (m d, m d) that takes coordinates y to displacements ``delta = G y`` with the cost ``|y|^2``.
 
-    The cost is ``delta^T H delta``. The matrix H is the sum of two matrices. The first has the demonstrated precisions
-    as diagonal blocks; the second gives the squared jerk of the displacement.
+    The cost is ``delta^T H delta``. The matrix H is the sum of two matrices. The first has the inverse demonstrated
+    covariances as diagonal blocks. The second gives the squared jerk of the displacement, times its weight.
 
     Args:
         path: the path and its components.
         allowed: directions in which components may move; for each component, ``delta`` has d coordinates along them.
         moved: indices of the m components that may move.
-        smoothness: weight of the squared jerk, in units of the largest nominal jerk.
+        smoothness: weight of the squared jerk, which is divided by the squared largest jerk of the nominal path.
     """
     axes, m, d = allowed.axes, len(moved), allowed.dimension
     index, h = np.arange(m), np.zeros((m, d, m, d))
@@ -433,12 +434,12 @@ def style_scale(path: ComponentPath, allowed: AllowedDirections, moved: Index, s
 
 @dataclass(frozen=True, eq=False)
 class AvoidanceProblem:
-    """The problem that a method of adaptation solves.
+    """The problem that an adaptation method solves: a path, obstacles and a required clearance.
 
     Attributes:
         path: the nominal path and its components.
         nominal: distances from the tool to every obstacle along the nominal path.
-        clearance: required [m].
+        clearance: required clearance [m].
         allowed: directions in which components may move.
     """
 
@@ -448,33 +449,33 @@ class AvoidanceProblem:
     allowed: AllowedDirections
 
     def evaluated(self, displacement: Array) -> Detour:
-        """Return the path with its certificate when the components move by ``displacement`` (n_components, 3) [m]."""
+        """Return the path for a displacement of the components (n_components, 3) [m], with its guaranteed clearance."""
         there = self.nominal.tool.clearance_of(self.path.displaced(displacement))
         return LeastDetour(self.path, self.nominal.tool, self.clearance, self.allowed).evaluate(displacement, there)
 
 
 class PathAdapter(ABC):
-    """One method of adapting a path.
+    """Base class of the adaptation methods.
 
-    To add a method, write one file and register it in ``ADAPTERS`` or by an entry point.
+    To add a method, write a subclass, and register an object of it in ``ADAPTERS`` or as a plugin (entry point).
 
     Attributes:
-        refuses: whether the method detects that it can't keep the clearance. ``ACFRA`` then refuses to move. If this
-            attribute is False, the path is always followed, so that the methods can be compared.
+        refuses: whether ``ACFRA`` refuses to move if the path of this method does not keep the clearance. If False,
+            ``ACFRA`` always follows the path, so that the methods can be compared.
     """
 
     refuses: ClassVar[bool] = False
 
     @abstractmethod
     def detour(self, problem: AvoidanceProblem) -> Detour:
-        """Return a displaced path with its certificate; :meth:`AvoidanceProblem.evaluated` computes both."""
+        """Return a displaced path with its guaranteed clearance, computed by :meth:`AvoidanceProblem.evaluated`."""
 
 
 def best_of(detours: Iterable[Detour | None]) -> Detour | None:
     """Return the best detour; None when there is none.
 
-    Feasible detours rank first. Detours that are only within the limits rank second, and all other detours last. Within
-    each group, the detour with the largest clearance is the best.
+    The order of preference is: feasible detours, detours within the limits on displacement and steps, all others. Among
+    detours of the same kind, the detour with the largest guaranteed clearance is the best.
     """
     found = [detour for detour in detours if detour is not None]
     return max(found, key=lambda x: (x.feasible, not x.out_of_limits, x.lowest), default=None)

@@ -1,4 +1,4 @@
-"""The cost of being near a moving obstacle (thesis Eqs 5.1 and 5.5, corrected)."""
+"""ObstacleCost: the cost of a tool position near obstacles (thesis Eqs 5.1 and 5.5, corrected)."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _NEGLIGIBLE = 14.0  # exp(-14) is 1e-6: a smaller cost has no effect
 
 
 class PredictedObstacles(NamedTuple):
-    """Obstacles, predicted at the instants of the horizon.
+    """Obstacles, predicted for H times of a horizon.
 
     Attributes:
         packed: the n observed obstacles.
-        times: time of each instant since the observation, shape (H,) [s].
-        margin: additional distance required to each obstacle at each instant, shape (n, H) [m].
+        times: times since the observation for which the obstacles are predicted, shape (H,) [s].
+        margin: distance that is required in addition to the clearance, for each obstacle and time, shape (n, H) [m].
     """
 
     packed: PackedObstacles
@@ -36,12 +36,12 @@ class PredictedObstacles(NamedTuple):
 
 
 class Groups(NamedTuple):
-    """Pairs of an obstacle and a sphere of the tool, each at one instant.
+    """Pairs of an obstacle and a sphere of the tool, each pair at one time of the horizon.
 
     Attributes:
-        obstacle: index of the obstacle, shape (k,).
-        instant: index of the instant, shape (k,).
-        sphere: index of the sphere of the tool, shape (k,).
+        obstacle: index of the obstacle of each pair, shape (k,).
+        instant: index of the time of each pair, shape (k,).
+        sphere: index of the tool's sphere of each pair, shape (k,).
     """
 
     obstacle: Indices
@@ -51,7 +51,7 @@ class Groups(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ObstacleCost(ABC):
-    """Cost of the nearness of a tool to obstacles; spheres represent the tool.
+    """Base class: a cost for each position of the tool, which increases near obstacles. Spheres represent the tool.
 
     Attributes:
         clearance: required distance of the tool to every obstacle [m].
@@ -63,7 +63,7 @@ class ObstacleCost(ABC):
 
     @abstractmethod
     def influence(self, packed: PackedObstacles) -> Array:
-        """Return the distances between tool and obstacles beyond which the cost is negligible, shape (n,) [m]."""
+        """Return the distance from each obstacle beyond which the cost is negligible, shape (n,) [m]."""
 
     def gaps(self, obstacles: PredictedObstacles, groups: Groups, origins: Array, scales: Array, moves: Array) -> Array:
         """Return the distances between spheres and obstacles, minus the margin, for C candidates, shape (k, C) [m].
@@ -74,8 +74,8 @@ class ObstacleCost(ABC):
             obstacles: n obstacles at H instants.
             groups: k pairs.
             origins: centres of the spheres, shape (k, 3) [m].
-            scales: factor of the candidates' displacements for each pair, shape (k,) [m].
-            moves: displacements of the candidates in units of ``scales``, shape (C, 3).
+            scales: factor of the candidates' ``moves`` for each pair, shape (k,) [m].
+            moves: direction and relative size of each candidate's displacement, shape (C, 3).
         """
         times = obstacles.times[groups.instant]
         gaps = displaced_distances(obstacles.packed, groups.obstacle, times, origins, scales, moves)
@@ -94,7 +94,7 @@ class ObstacleCost(ABC):
     ) -> Array:
         """Return the cost of each pair for each candidate, shape (k, C).
 
-        The cost of a tool of several spheres is the largest cost of its spheres.
+        For a tool with several spheres, the largest of their costs counts.
 
         Args:
             obstacles: n obstacles at H instants.
@@ -116,18 +116,18 @@ class DistanceCost(ObstacleCost):
 
     .. math:: b = \exp(-(gap - d_{safe}) / w), \qquad gap = sd(\chi) - r - margin
 
-    Here ``sd`` is the signed distance of the predicted obstacle at the centre of a sphere of the tool, and ``r`` is the
-    sphere's radius. The cost is 1 at the required clearance ``d_safe`` and grows by the factor e for each width ``w``
-    towards the obstacle. At 14 widths from the required clearance it is 1e-6; this serves as the cut-off.
+    Here, ``sd`` is the signed distance from the predicted obstacle to the centre ``chi`` of a sphere of the tool, and
+    ``r`` is the radius of the sphere. The cost is 1 at the required clearance ``d_safe``. It increases by the factor e
+    whenever the gap decreases by the width ``w``. Beyond ``d_safe + 14 w``, the cost is below 1e-6 and counts as 0.
 
     Attributes:
-        width: w [m].
+        width: width w [m].
     """
 
     width: float = 0.01
 
     def influence(self, packed: PackedObstacles) -> Array:
-        """Return the distances beyond which the cost is negligible, shape (n,) [m]."""
+        """Return the distance from each obstacle beyond which the cost is negligible, shape (n,) [m]."""
         return np.full(len(packed), self.influence_distance)
 
     @property
@@ -163,7 +163,7 @@ class DistanceCost(ObstacleCost):
 
 @dataclass(frozen=True, eq=False)
 class GaussianCost(ObstacleCost):
-    r"""Gaussian cost about the obstacle's centre, as in the thesis; its mean over the tracker's uncertainty is used.
+    r"""Gaussian cost about the obstacle's centre, as in the thesis, averaged over the uncertainty of the tracker.
 
     .. math::
         b &= \alpha\,|L|^{1/2} |L + P|^{-1/2}
@@ -171,23 +171,23 @@ class GaussianCost(ObstacleCost):
 
         L &= R\,\mathrm{diag}(\ell_j^2)\,R^T, \qquad \ell_j = \tfrac12 (a_j + r + d_{safe})
 
-    Here ``a_j`` are the obstacle's semi-axes, ``r`` is the radius of a sphere of the tool and ``P`` is the covariance
-    of the predicted position. The thesis computes a mean over samples (Eq 5.5, whose exponent lacks its minus sign);
-    the formula above is the exact mean over the covariance P.
+    Here, ``a_j`` are the obstacle's semi-axes, and R is its rotation. ``r`` is the radius of a sphere of the tool, and
+    ``chi`` its centre. ``P`` is the covariance of the obstacle's predicted position ``y``. The thesis computes a mean
+    over samples (Eq 5.5, whose exponent lacks its minus sign). The formula above is the exact mean.
 
-    The height of the Gaussian is ``alpha = 2 k l^2 exp(2)``, where l is the least of the three lengths. A deviation d
-    of the tool during the whole horizon has the task cost ``k |d|^2 / 2``. At the distance 2 l from the obstacle's
-    centre, the tool has exactly the required clearance. At this distance, the obstacle's cost of one instant equals the
-    task cost of a deviation of 2 l, with which the tool gets around the obstacle.
+    The height of the Gaussian is ``alpha = 2 k l^2 exp(2)``, where l is the smallest of the three lengths ``l_j``. The
+    reason is as follows. At the distance 2 l from the obstacle's centre, the tool has exactly the required clearance.
+    If the tool deviates by 2 l during the whole horizon, it gets around the obstacle, at the task cost ``k (2 l)^2 /
+    2``. With this alpha, the obstacle's cost at the distance 2 l is equal to this task cost.
 
     Attributes:
-        stiffness: k, twice the task cost of a unit deviation during the whole horizon [1/m^2].
+        stiffness: k, twice the task cost of a deviation of 1 m during the whole horizon [1/m^2].
     """
 
     stiffness: float = 1.0
 
     def influence(self, packed: PackedObstacles) -> Array:
-        """Return the distances beyond which the cost is negligible, shape (n,) [m]."""
+        """Return the distance from each obstacle beyond which the cost is negligible, shape (n,) [m]."""
         reach = np.sqrt(2.0 * _NEGLIGIBLE)
         axes = _semi_axes(packed).max(axis=1)
         longest = 0.5 * (axes + float(self.radii.max()) + self.clearance)

@@ -1,13 +1,13 @@
-"""Passages between obstacles: a grid of positions that shows where a passage may be, or proves that none exists.
+"""Passages between obstacles: a grid of tool positions that proposes a path, or proves that no path exists.
 
-The grid covers all positions that the path may reach, and is aligned with an obstacle. A cell is blocked if all its
-corners are inside one inflated obstacle. The inflated obstacle is convex, so the whole cell is then inside. If no chain
-of cells that are not blocked joins the fixed points of the path, there is no path, and no further search is necessary.
-Otherwise, the chain of least cost proposes a path. This path may lead to places that no straight ray from the nominal
-path reaches, for example back out of a shelf.
+The grid covers all positions that the path may reach, and is aligned with an obstacle. The obstacles are enlarged by
+the required clearance and the radius of the tool. A cell of the grid is blocked if all its corners are inside one
+enlarged obstacle. Enlarged obstacles are convex, so the whole cell is then inside. If no chain of free cells joins the
+start, the pinned points and the goal of the path, there is no path. Otherwise, the cheapest chain proposes a path. Such
+a path may reach positions that no straight ray from the nominal path reaches, for example out of a shelf.
 
-The grid does not depend on time. It is used only if the obstacles are at rest and the tool does not rotate about its
-tip. The largest sphere at the tip then represents the tool.
+The grid does not depend on time, so it contains only obstacles at rest. Its tool is the largest of the spheres with the
+centre at the tip; without such a sphere, the grid is not used.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Passages:
     Args:
         path: the nominal path and its components.
         tool: the tool and the obstacles.
-        clearance: required [m].
+        clearance: required clearance [m].
         allowed: directions in which components may move; they must span at least two dimensions.
     """
 
@@ -139,9 +139,9 @@ class Passages:
         return bool(met.min() == 0 or np.ptp(met) > 0)
 
     def route(self) -> Array | None:
-        """Return the chain of least cost as displacements of the tip at all samples (n, 3) [m]; None without a chain.
+        """Return the cheapest chain as displacements of the tip at all samples (n, 3) [m]; None if there is no chain.
 
-        The chain may lead a little too close to obstacles.
+        The positions of the chain may be a little too close to obstacles.
         """
         if not self._obstacles:
             return None

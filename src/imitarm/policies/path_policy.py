@@ -40,11 +40,11 @@ class PathPlan:
     """The motion that a :class:`PathPolicy` follows.
 
     Attributes:
-        trajectory: path of the tool with times, n samples. Without quaternions, the tool keeps its rotation.
-        displaced: distance of each sample from the learned path, shape (n,) [m].
+        trajectory: path of the tool with times, n samples. If it has no quaternions, the tool keeps its rotation.
+        displaced: distance of each sample from the learned path at the same fraction of the duration, shape (n,) [m].
         joints: joint positions of the arm at the samples, shape (n, n_joints) [rad]; the joints move linearly between
             the samples. None if only the tool was planned.
-        only_on_schedule: whether the plan is valid only at the planned times, because an obstacle moves.
+        only_on_schedule: whether the plan keeps its clearance only at the planned times, because an obstacle moves.
         adaptation: the result of :func:`~imitarm.policies.adapt`, for reports; None if the method computes no
             adaptation.
     """
@@ -57,15 +57,15 @@ class PathPlan:
 
     @classmethod
     def beside(cls, nominal: Trajectory, trajectory: Trajectory) -> Self:
-        """Return the plan for a path of the tool; ``displaced`` is its distance from ``nominal`` at equal phases."""
+        """Return a plan that follows ``trajectory``; ``nominal`` is the learned path between the same ends."""
         phase = (trajectory.times - trajectory.times[0]) / trajectory.duration
         learned, _ = nominal.at(nominal.times[0] + phase * nominal.duration)
         return cls(trajectory, np.linalg.norm(trajectory.positions - learned, axis=1))
 
     def within(self, max_speed: float, max_acceleration: float) -> PathPlan:
-        """Return the plan, slowed down where the tool would exceed a limit; the path stays the same.
+        """Return a plan with the same path, slowed down where the tool would exceed a limit.
 
-        A plan that is already within the limits, or is valid only on schedule, or has planned joints, is not changed.
+        A plan that is valid only at its planned times or that has ``joints`` is returned unchanged.
 
         Args:
             max_speed: largest speed of the tool [m/s].
@@ -83,33 +83,32 @@ class PathPlan:
 class PathPolicy(Policy):
     r"""Plan the whole path of the tool once, then follow it.
 
-    A subclass implements :meth:`plan_motion`. The method ``reset`` calls it for the observed scene. The method ``step``
-    follows the planned path with the path's velocity plus feedback::
+    A subclass implements :meth:`plan_motion`, which ``reset`` calls for the observed scene. The method ``step``
+    commands the velocity ``v_d`` of the planned path plus feedback::
 
         twist = r v_d(s) + K [p_d(s) - p; log(R_d(s) R^T)],     ds/dt = r = max(0, 1 - (|p_d - p| / e_0)^2)
 
-    Here, ``p`` and ``R`` are the measured position and rotation of the tool, and the index d marks their desired
-    values. The phase ``s`` slows down if the robot lags behind, for example because of its speed limits or because a
-    hand holds it. A robot that has left the path returns along the straight line from the tool to its target on the
-    path. The tool and its target both keep the clearance. While the phase moves, each point of the line is within ``e_0
-    / 2`` of the tool or of the target. If ``e_0`` is the required clearance, the line therefore reduces the clearance
-    by at most half.
+    Here, ``p`` and ``R`` are the measured position and rotation of the tool, and ``p_d`` and ``R_d`` are their desired
+    values at the phase ``s`` [s]. The rate ``r`` of the phase decreases if the tool lags behind, for example because of
+    its speed limits or because a hand holds it. The feedback moves the tool along the straight line to the desired
+    position. While the phase moves, this line is shorter than ``e_0``. If ``e_0`` is the required clearance, and tool
+    and desired position keep it, every point of the line therefore keeps at least half of it.
 
-    Among moving obstacles, a plan may be valid only at the planned times. The phase of such a plan follows the clock
-    and does not wait. If the tool is farther than ``e_0 / 2`` from its planned position, the plan is no longer valid.
-    The arm then brakes and stays at rest.
+    If obstacles move, a plan may be valid only at the planned times. The phase is then the time since the start, and
+    does not wait. As soon as the tool is farther than ``e_0 / 2`` from its planned position, the plan becomes invalid,
+    and the arm brakes and stays at rest.
 
     Args:
         skill: skill to reproduce.
         gain: K, the feedback gain of position and rotation [1/s].
-        patience: e_0, the position error at which the phase stops [m]; None: the clearance, at least 5 mm.
-        arrival: the motion has arrived when the tool is nearer than this to the end of the path [m].
+        patience: e_0, the position error at which the phase stops [m]; None: the clearance, but at least 5 mm.
+        arrival: distance from the end of the path below which the tool has arrived [m].
         options: arguments of :class:`~imitarm.policies.Policy`.
 
     Attributes:
-        search_space: options of the constructor that a benchmark may tune, each with its lowest and highest value. The
-            values are searched on a logarithmic scale.
-        motion: the plan of the last ``reset``.
+        search_space: arguments of the constructor that a benchmark may tune, each with its lowest and highest value.
+            The benchmark chooses values on a logarithmic scale.
+        motion: the plan that the last ``reset`` computed.
     """
 
     search_space: ClassVar[Mapping[str, tuple[float, float]]] = {}
@@ -139,8 +138,8 @@ class PathPolicy(Policy):
         """Plan the whole motion in a scene.
 
         Args:
-            scene: goal and obstacles at the time at which the motion begins; if the goal is None, the learned goal is
-                used.
+            scene: goal and obstacles at the start of the motion; if the goal is None, the motion ends at the learned
+                goal.
             start: pose of the tool at the start; None: the learned start.
             state: measured state of the arm, for methods that plan its joints.
 
@@ -178,12 +177,12 @@ class PathPolicy(Policy):
 
     @property
     def plan(self) -> Adaptation | None:
-        """The result of the last adaptation, which reports draw; None if the method computes no adaptation."""
+        """The result of the last adaptation, for drawing it in reports; None if the method computes no adaptation."""
         return None if self.motion is None else self.motion.adaptation
 
     @property
     def phase(self) -> float:
-        """The phase of the motion, as a time in the planned motion [s]."""
+        """Phase of the motion: the time in the planned motion that the tool has reached [s]."""
         return self._phase
 
     def step(self, observation: Observation, dt: float) -> Command:
@@ -249,7 +248,7 @@ class PathPolicy(Policy):
         return Pose(positions[0], self._hold.quaternion if quaternions is None else quaternions[0])
 
     def finished(self, observation: Observation) -> bool:
-        """Return whether the phase is at its end, and the tool is nearer than ``arrival`` to the end of the path."""
+        """Return whether the planned motion is over and the tool is nearer than ``arrival`` to the end of the path."""
         if self.motion is None or self._void:
             return False
         path = self.motion.trajectory

@@ -1,19 +1,18 @@
-r"""PlanInExecution: a certified plan that an arm follows on time, and the check that its assumptions still hold.
+r"""PlanInExecution: a plan with guaranteed clearance that an arm follows, and checks of the plan's assumptions.
 
-The certificate of a plan assumes that the arm is on schedule, and that each obstacle i is within its margin :math:`m_i`
-of its predicted position. If the certified clearance :math:`c_0` exceeds the required clearance c, the obstacle may
-even leave its margin.
-It is sufficient that the following inequality holds:
+A *certified* plan guarantees the required clearance c, for example to obstacle i. The guarantee assumes that the arm is
+on time, and that the prediction of obstacle i is wrong by at most the margin :math:`m_i`. If the certified clearance
+:math:`c_0` exceeds c, the error may be larger. It is sufficient that
 
 .. math:: |p_i(t) - \hat p_i(t)| + r_i \, |\theta_i(t)| + s_i(t) \le m_i(t) + c_0 - c
 
 Here, :math:`p_i` is the observed position of the obstacle, and :math:`\hat p_i` is the position that the plan predicted
 for this time. :math:`r_i` is the radius of a sphere that contains the obstacle. :math:`\theta_i` is the angle between
-the observed and the predicted rotation, and :math:`s_i` is the growth of the obstacle's largest size since the plan was
-made. If the inequality holds, the distance to the obstacle is at least c.
+the observed and the predicted rotation, and :math:`s_i` is the largest change of one of the obstacle's sizes since the
+plan was made.
 
-If the inequality does not hold, the rest of the plan may still be clear of the observed obstacles. A new certificate is
-then computed for the same motion, which takes a fraction of the time of planning.
+If the inequality does not hold, the rest of the plan may still keep the clearance. The guarantee is then computed again
+for the same motion and the observed obstacles. This computation takes a fraction of the time of planning.
 """
 
 from __future__ import annotations
@@ -43,22 +42,21 @@ _DISPLACED = 1e-3  # [m] from the learned path: less is not called avoiding
 
 @dataclass(frozen=True, eq=False)
 class PlanInExecution:
-    """A certified plan of the whole arm, and the time at which its execution began.
+    """A certified plan of the whole arm, in execution since the time ``began``.
 
     Attributes:
         adaptation: the plan.
         began: time at which the execution of the plan began [s].
-        offset: time in the learned motion at which the plan begins [s].
-        scene: the obstacles that the certificate assumes, at the time ``seen``.
-        seen: the time from which the certificate holds [s].
-        margins: for each of these obstacles, its margin from the time ``seen`` on, or None for an obstacle without a
-            margin.
+        offset: time in the learned motion that corresponds to the start of the plan [s].
+        scene: the obstacles at the time ``seen``, for which the guarantee was computed.
+        seen: time from which the guarantee holds [s].
+        margins: margin of each of these obstacles, from the time ``seen`` on; None for an obstacle without a margin.
         clearance: required clearance [m].
-        certified: certified clearance [m].
-        approach: duration of the motion to the first posture of the path [s]; it is part of the plan.
-        trajectory: the tool's path of the whole motion, from time 0.
-        joints: the joint positions at the samples of ``trajectory``, shape (n, n_joints) [rad].
-        until: the time at which the certificate ends [s]; inf: it covers the whole plan.
+        certified: guaranteed clearance [m].
+        approach: duration of the motion to the first posture of the path, which is a part of the plan [s].
+        trajectory: path of the tool in the whole plan; its times start at 0.
+        joints: joint positions at the n samples of ``trajectory``, shape (n, n_joints) [rad].
+        until: time at which the guarantee ends [s]; inf: it covers the whole plan.
     """
 
     adaptation: Adaptation
@@ -85,7 +83,7 @@ class PlanInExecution:
         margins: Sequence[PredictionMargin | None],
         clearance: float,
     ) -> PlanInExecution:
-        """Return the plan; its arguments are the attributes of the same names."""
+        """Return the plan; the arguments have the same meaning as the attributes with the same names."""
         path, joints, approach = adaptation.trajectory, adaptation.joints, adaptation.approach
         assert joints is not None
         lead = 0.0
@@ -121,21 +119,21 @@ class PlanInExecution:
         return _at(time - self.began, self.trajectory.times, self._velocities)
 
     def phase_at(self, time: float) -> float:
-        """Return the phase at a time [s]: the time since the approach ended [s]."""
+        """Return the time since the end of the approach [s] (the phase of the path) at ``time`` [s]."""
         return max(time - self.began - self.approach, 0.0)
 
     def learned_at(self, time: float) -> float:
-        """Return the time in the learned motion that the plan has reached at a time [s]."""
+        """Return the time in the learned motion [s] that the plan has reached at ``time`` [s]."""
         done, learned = self.adaptation.trajectory.times, self.adaptation.nominal.times
         return self.offset + float(np.interp(self.phase_at(time), done, learned))
 
     def phase_of(self, learned: float) -> float:
-        """Return the phase at a time in the learned motion; the inverse of :meth:`learned_at` [s]."""
+        """Return the phase [s], see :meth:`phase_at`, at which the plan reaches a time [s] in the learned motion."""
         done, times = self.adaptation.trajectory.times, self.adaptation.nominal.times
         return float(np.interp(learned - self.offset, times, done))
 
     def waits_at(self, time: float) -> bool:
-        """Return whether the plan lets the arm wait at a time [s]."""
+        """Return whether the arm waits at ``time`` [s], according to the plan."""
         done, learned = self.adaptation.trajectory.times, self.adaptation.nominal.times
         phase = self.phase_at(time)
         i = int(np.clip(np.searchsorted(done, phase, side="right"), 1, len(done) - 1))
@@ -149,14 +147,14 @@ class PlanInExecution:
         return displaced if displaced > _DISPLACED else 0.0
 
     def off_schedule(self, arm: ArmModel, time: float, state: ArmState, tool: Pose, patience: float) -> str:
-        """Return a text that says why the arm is not on schedule; empty if the arm is on schedule.
+        """Return a text that says how far the tool is from its planned position; empty if the distance is accepted.
 
         Args:
             arm: the arm.
             time: the current time [s].
             state: measured state of the arm.
             tool: measured pose of the tool.
-            patience: accepted error of the tool's position [m].
+            patience: largest accepted distance [m].
         """
         lag = float(np.linalg.norm(arm.tool_pose(self.joints_at(time)).position - tool.position))
         if lag > patience:
@@ -164,10 +162,10 @@ class PlanInExecution:
         return ""
 
     def unforeseen(self, scene: Scene) -> str:
-        """Return a text that says how the obstacles differ from the plan's assumption; empty if the certificate holds.
+        """Return a text that names an obstacle that violates the plan's assumptions; empty if none does.
 
         Args:
-            scene: the obstacles as seen now; its stamp is now.
+            scene: the obstacles as observed now; its stamp is the current time.
         """
         seen = scene.packed
         if not len(seen):
@@ -201,17 +199,19 @@ class PlanInExecution:
         hold: float,
         horizon: float = np.inf,
     ) -> PlanInExecution | None:
-        """Return the same plan with a new certificate for the observed obstacles; None if the rest is not clear.
+        """Return the plan with a new guarantee for the observed obstacles; None if the rest of the plan is too close.
 
-        Tracked obstacles are predicted with noise, so the far future is uncertain. If the whole rest is not clear of
-        them, the certificate may cover the near future only. The plan must then be certified again before it ends.
+        Predictions of tracked obstacles are uncertain far ahead. If the whole rest of the plan does not keep the
+        clearance, but the next ``horizon`` seconds do, the guarantee covers only this time. Call the method again
+        before the guarantee ends.
 
         Args:
             arm: the arm.
-            scene: the obstacles as seen now; its stamp is now.
-            margins: for each of these obstacles, its margin from now on, or None for an obstacle without a margin.
-            hold: the arm must keep its clearances at the goal for this long after the arrival [s].
-            horizon: how far the certificate must reach among tracked obstacles [s]; inf: to the end.
+            scene: the obstacles as observed now; its stamp is the current time.
+            margins: margin of each of these obstacles from now on; None for an obstacle without a margin.
+            hold: time for which the arm must keep its clearances at the goal after the arrival [s].
+            horizon: smallest time that the guarantee must cover if there are tracked obstacles [s]; inf: the whole
+                plan.
         """
         now, times = scene.stamp, self.trajectory.times + self.began
         later = times > now

@@ -1,4 +1,4 @@
-"""The interface of every policy: it observes an arm and its scene, and returns a command."""
+"""Policy: the interface of all policies, which observe an arm and its scene and return commands."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Observation:
         time: time since the reproduction began [s].
         state: measured state of the arm.
         tool_to_base: measured pose of the tool in the base frame.
-        scene: goal and obstacles as last seen, at the time ``scene.stamp``; ``scene.at(time)`` predicts the
+        scene: goal and obstacles at the time of the last detections, ``scene.stamp``. ``scene.at(time)`` predicts the
             obstacles at the current time.
     """
 
@@ -53,15 +53,16 @@ class Policy(ABC):
     To write your own policy, implement the methods :meth:`reset`, :meth:`step` and :meth:`finished` in a subclass.
     Register the policy under the entry point group ``imitarm.policies``, or by ``POLICIES.register(name, policy)``. The
     policy then appears in ``imitarm reproduce --policy``, in ``imitarm benchmark placements`` and in their reports.
-    These commands construct the policy with the arguments below. The state of a policy lasts from :meth:`reset` to the
-    end of one reproduction; the same observations give the same commands.
+    These commands construct the policy with the arguments below. A policy must be deterministic: after each
+    :meth:`reset`, the same observations must give the same commands.
 
     Args:
         skill: the skill to reproduce.
-        tool_spheres: spheres that contain the tool, rows x y z r in the tool's frame, shape (m, 4) [m]; None: its tip.
+        tool_spheres: spheres that contain the tool, rows x y z r in the tool's frame, shape (m, 4) [m]; None: the tool
+            is a point.
         clearance: required distance of the tool to every obstacle [m].
-        forbidden: directions in which the motion must not leave the learned path, shape (m, 3).
-        arm: the arm that will move, for policies that plan its joint motion; None: the arm is not known.
+        forbidden: directions in which the path must not be displaced from the learned path, shape (m, 3).
+        arm: the arm that executes the commands, for policies that plan joint motions; None: unknown.
 
     Attributes:
         plan: plan to draw in a report, an :class:`~imitarm.policies.Adaptation`; None if the policy has no plan.
@@ -88,13 +89,13 @@ class Policy(ABC):
 
     @classmethod
     def build(cls, skill: Skill, **options: Any) -> Self:
-        """Return a policy, built from the arguments that the command line and the benchmark give to every policy.
+        """Return a policy, constructed with the options that the command line and the benchmarks pass to every policy.
 
-        If the constructors of the class and of its base classes do not take the options about the arm or pinned times,
-        these options are left out.
+        The options ``arm``, ``max_tilt``, ``goal_tilt`` and ``pinned`` are passed only to policies whose constructors
+        take them.
 
         Raises:
-            InputError: when the constructor does not take one of the other options.
+            InputError: when the constructor does not take another option.
         """
         known = _parameters(cls)
         options = {name: value for name, value in options.items() if name in known or name not in _NEED_NOT_HAVE}
@@ -111,8 +112,8 @@ class Policy(ABC):
         """Start a reproduction in the observed scene.
 
         Raises:
-            InfeasibleError: when the policy finds in advance that the reproduction is impossible; the message gives the
-                reason.
+            InfeasibleError: when the policy finds before the motion that the reproduction is impossible; the message
+                gives the reason.
         """
 
     @abstractmethod
@@ -121,7 +122,7 @@ class Policy(ABC):
 
     @abstractmethod
     def finished(self, observation: Observation) -> bool:
-        """Return whether the motion has arrived."""
+        """Return whether the motion is over and the tool has arrived at the goal."""
 
 
 def _parameters(policy: type[Policy]) -> set[str]:

@@ -1,6 +1,6 @@
-r"""The additional distance that a plan keeps to an obstacle whose motion is only predicted.
+r"""PredictionMargin: the additional distance that a plan keeps from an obstacle whose position is only predicted.
 
-The error of a prediction grows with the time :math:`\tau` since the obstacle was seen. A
+The error of a prediction grows with the time :math:`\tau` since the obstacle was last detected. A
 :class:`~imitarm.perception.CoverageMargin` bounds this error by :math:`m(\tau) = a + b\,\tau`. With a stated
 probability, the bound holds for all :math:`\tau` up to the calibrated horizon. At each time t, a plan keeps the
 distance
@@ -8,12 +8,13 @@ distance
 .. math:: d_i(t) \ge c + m_i(t), \qquad m_i(t) = a + b \min(t + \tau_i, T) .
 
 Here, :math:`d_i` is the distance to the predicted obstacle i, and c is the required clearance. :math:`\tau_i` is the
-age of the obstacle's estimate at time 0. T is the horizon, after which the margin no longer grows. As long as the
-prediction is wrong by at most :math:`m_i`, the distance to the true obstacle is at least c.
+time between the last detection of the obstacle and the start of the plan (t = 0). T is the horizon: the margin does not
+grow after the time T. As long as the prediction is wrong by at most :math:`m_i`, the distance to the true obstacle is
+at least c.
 
 The function :math:`m_i` is concave, so on a straight segment of the path, :math:`d_i - m_i` is a convex function of
-time, like :math:`d_i` itself. The certificates therefore also hold for :math:`d_i - m_i`; they use the slopes of
-:math:`m_i` on the two sides of a sample.
+time, like :math:`d_i` itself. The modules ``certificate`` and ``arm_certificate`` can therefore treat :math:`d_i - m_i`
+like a distance.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class PredictionMargin:
     Attributes:
         offset: margin at time 0 [m].
         growth: growth of the margin with time [m/s].
-        until: time after which the margin does not grow [s].
+        until: time from which on the margin is constant [s].
     """
 
     offset: float
@@ -46,30 +47,31 @@ class PredictionMargin:
     until: float = np.inf
 
     def at(self, times: Array) -> Array:
-        """Return m at times [s], of the same shape [m]."""
+        """Return the margin [m] at each of ``times`` [s]."""
         return np.asarray(self.offset + self.growth * np.minimum(times, self.until))
 
     def slopes_after(self, times: Array) -> Array:
-        """Return the derivative of m just after times [s], of the same shape [m/s]."""
+        """Return the time derivative of the margin [m/s] just after each of ``times`` [s]."""
         return np.where(times < self.until, self.growth, 0.0)
 
     def slopes_before(self, times: Array) -> Array:
-        """Return the derivative of m just before times [s], of the same shape [m/s]."""
+        """Return the time derivative of the margin [m/s] just before each of ``times`` [s]."""
         return np.where(times <= self.until, self.growth, 0.0)
 
 
 def margins_in(
     scene: Scene, margin: CoverageMargin | None, margin_horizon: float | None
 ) -> tuple[PredictionMargin | None, ...]:
-    """Return, for each obstacle of a scene, its margin, or None if its position is known exactly.
+    """Return the margin of each obstacle of a scene; None for an obstacle whose position is known exactly.
 
-    An obstacle has a margin if it moves, or if a tracker estimates it (it has a ``track_id`` or a ``covariance``). The
-    scene gives the exact position of every other obstacle.
+    An obstacle has a margin if it moves, or if a tracker estimates it, so that it has a ``track_id`` or a
+    ``covariance``. The positions of all other obstacles are exact.
 
     Args:
-        scene: obstacles at the time at which a plan begins. ``scene.packed.stamps`` says when each was seen.
-        margin: bound of the prediction error; None: predictions are exact.
-        margin_horizon: the margin grows until this time after the obstacle was seen [s]; None: it grows without end.
+        scene: obstacles at the start of a plan. ``scene.packed.stamps`` contains the time of each obstacle's last
+            detection.
+        margin: bound of the prediction error; None: predictions count as exact.
+        margin_horizon: time after the last detection of an obstacle at which the margin stops to grow [s]; None: never.
 
     Raises:
         InputError: when an argument is not valid.
@@ -90,5 +92,5 @@ def margins_in(
 
 
 def is_predicted(obstacle: Obstacle) -> bool:
-    """Return whether the position of an obstacle is only estimated, because it was tracked or because it moves."""
+    """Return whether an obstacle moves or is estimated by a tracker, so that its position is not known exactly."""
     return obstacle.track_id is not None or obstacle.covariance is not None or obstacle.moves

@@ -1,4 +1,4 @@
-"""PrimitivePath: the motion of a skill's primitive as tables over the phase, with the learned precision."""
+"""PrimitivePath: the motion of a skill's primitive and the learned precision, as tables over the phase."""
 
 from __future__ import annotations
 
@@ -26,15 +26,14 @@ _UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 class PrimitivePath:
     r"""The motion xi(s) of a motion primitive; the phase s runs from 0 at the start to 1 at the goal.
 
-    The motion depends on the goal g linearly: if the goal moves by delta, the motion moves by ``p(s) delta``, where p
-        is the fraction of the path that has been travelled. If the goal moves, the motion therefore need not be
-        integrated again.
+    If the goal moves by delta, the motion moves by ``p(s) delta``, where p increases from 0 at the start to 1 at the
+    goal. After a change of the goal, the primitive is therefore not integrated again.
 
     Attributes:
         duration: duration of the motion [s].
         goal: pose of the tool (tool_to_base) at the end of the motion.
         positions: xi at n + 1 equally spaced phases, shape (n + 1, 3) [m].
-        progress: p, the travelled fraction of the path at each phase, shape (n + 1,).
+        progress: the factor p at each phase, shape (n + 1,).
         precision: the matrices Theta of :func:`learned_precision`, shape (n + 1, 3, 3).
         quaternions: learned rotations wxyz, shape (n + 1, 4); None when no rotation was learned.
     """
@@ -54,9 +53,9 @@ class PrimitivePath:
 
         Args:
             dmp: the primitive.
-            precision: Theta, shape (n + 1, 3, 3).
-            start: pose of the tool at the start; None: as learned.
-            goal: pose of the tool at the end; None: as learned.
+            precision: result of :func:`learned_precision`, shape (n + 1, 3, 3).
+            start: pose of the tool at the start; None: the learned start.
+            goal: pose of the tool at the end; None: the learned goal.
         """
         T = dmp.duration_
         motion = dmp.generate(start, goal, dt=T / N_SAMPLES)
@@ -67,7 +66,7 @@ class PrimitivePath:
         return cls(dmp, start, T, goal, motion.positions, progress, precision, motion.quaternions)
 
     def to(self, goal: Pose) -> PrimitivePath:
-        """Return the motion to another goal."""
+        """Return the motion from the same start to another goal."""
         positions = self.positions + self.progress[:, None] * (goal.position - self.goal.position)
         quaternions = self.quaternions
         if quaternions is not None and not np.array_equal(goal.quaternion, self.goal.quaternion):
@@ -75,14 +74,14 @@ class PrimitivePath:
         return replace(self, goal=goal, positions=positions, quaternions=quaternions)
 
     def positions_at(self, phases: Array) -> Array:
-        """Return xi at phases (...), shape (..., 3) [m]; a phase outside 0 to 1 counts as the nearest end."""
+        """Return the positions xi at phases (...), shape (..., 3) [m]; phases are clipped to the range from 0 to 1."""
         x = np.minimum(np.maximum(phases, 0.0), 1.0) * N_SAMPLES
         i = np.minimum(x.astype(np.intp), N_SAMPLES - 1)
         before = self.positions[i]
         return np.asarray(before + (x - i)[..., None] * self._steps[i])
 
     def position(self, phase: float) -> Array:
-        """Return xi at one phase from 0 to 1, shape (3,) [m]."""
+        """Return the position xi at one phase from 0 to 1, shape (3,) [m]."""
         x = phase * N_SAMPLES
         i = min(int(x), N_SAMPLES - 1)
         return np.asarray(self.positions[i] + (x - i) * self._steps[i])
@@ -96,7 +95,7 @@ class PrimitivePath:
         return np.rint(np.minimum(np.maximum(phases, 0.0), 1.0) * N_SAMPLES).astype(np.intp)
 
     def tangent(self, phase: float) -> Array:
-        """Return the direction of the motion (3,); where the motion rests, the direction to the goal; 0 at the goal."""
+        """Return the direction of the motion (3,), or of the goal where the motion rests; 0 at the goal."""
         i = min(int(phase * N_SAMPLES), N_SAMPLES - 1)
         along = self._steps[i]
         length = float(np.sqrt(along.dot(along)))
@@ -119,7 +118,7 @@ class PrimitivePath:
         """Return the C structure ``Path``.
 
         Args:
-            spheres: whether the tool has spheres that are not at its tip, so that its rotation matters.
+            spheres: whether the tool has spheres with the centre away from the tip, so that its rotation matters.
             hold: rotation wxyz (4,) that the tool keeps if no rotation was learned.
         """
         rotations = np.zeros(0)
@@ -141,14 +140,14 @@ class PrimitivePath:
 
 
 def learned_precision(skill: Skill) -> Array:
-    r"""Return the precision that the motion requires at n + 1 equally spaced phases, shape (n + 1, 3, 3).
+    r"""Return how precisely the tool must follow the motion at n + 1 equally spaced phases, shape (n + 1, 3, 3).
 
-    This is the matrix theta of thesis Eq 5.1: the inverse of the learned covariance, without its scale.
+    The precision is the matrix theta of thesis Eq 5.1: the inverse of the learned covariance Sigma, but without a unit.
 
     .. math:: \Theta(s) = \bar\sigma^2 (\Sigma(s) + \epsilon^2 I)^{-1}, \qquad \epsilon = 5\ mm
 
-    The factor is the mean variance of the motion, so a typical precision is 1. The eigenvalues are limited to the range
-    from 1/4 to 4, because even a very precise demonstration must not outweigh a collision.
+    The factor :math:`\bar\sigma^2` is the mean variance over the motion, so a typical precision is 1. The eigenvalues
+    are limited to the range from 1/4 to 4, so that no demonstration, however precise, counts more than a collision.
     """
     covariance = skill.tolerance(np.linspace(0.0, skill.duration_, N_SAMPLES + 1)) + _FLOOR**2 * np.eye(3)
     variances, axes = np.linalg.eigh(covariance)

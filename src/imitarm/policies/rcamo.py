@@ -1,4 +1,4 @@
-"""RCAMO, real-time collision avoidance for moving obstacles (thesis Chapter 5), by the least predicted cost."""
+"""RCAMO, real-time collision avoidance for moving obstacles (thesis Chapter 5)."""
 
 from __future__ import annotations
 
@@ -52,42 +52,43 @@ class _Near(NamedTuple):
 
 
 class RCAMO(Policy):
-    r"""Follow the primitive of a skill, and evade moving obstacles in the direction of least predicted cost.
+    r"""Follow the motion primitive of a skill, and evade moving obstacles by the motion with the least predicted cost.
 
     The skill's motion primitive (a DMP, fitted to the mean of GMR) gives the motion ``xi(s)`` for a scene without
-    obstacles; s is the phase. The tool's deviation ``e = x - xi(s)`` obeys the primitive's own spring and damper, with
-    a coupling acceleration ``u``:
+    obstacles. The phase s runs from 0 to 1. The tool is at ``x``. Its deviation ``e = x - xi(s)`` obeys the spring and
+    damper of the primitive, with a coupling acceleration ``u``:
 
     .. math:: \tau^2 \ddot e + D \tau \dot e + K e = \tau^2 u, \qquad \dot s = r / T
 
-    In every step, the policy chooses ``u`` and the speed ``r`` of the phase. It predicts the motion of the tool and of
-    the obstacles over a horizon for every candidate, and takes the candidate of least cost (thesis Eq 5.5, corrected;
-    see :class:`~imitarm.policies.least_cost.LeastCost`). The candidates include waiting and going back. If no obstacle
-    is near, ``u = 0``, and the spring brings the tool back to its path. If the robot lags behind, the phase stops.
+    In every step, the policy chooses ``u`` and the speed ``r`` of the phase. For every candidate, it predicts the
+    motion of the tool and of the obstacles over a horizon. It takes the candidate with the least cost (thesis Eq 5.5,
+    corrected; see :class:`~imitarm.policies.least_cost.LeastCost`). The candidates include waiting and moving
+    backwards. If no obstacle is near, ``u`` is 0, and the spring brings the tool back to its path. If the tool lags
+    behind its commanded position, the phase slows down or stops.
 
     The policy keeps only the tool clear of obstacles; the :class:`~imitarm.safety.SafetyFilter` keeps the links clear.
-    The policy decides step by step. Therefore it can't know in advance whether the motion will arrive, and never raises
+    The policy decides step by step. It does not know in advance whether the tool will reach the goal, and never raises
     InfeasibleError.
 
     Args:
         skill: skill to reproduce.
         cost: ``"distance"``: the cost of an obstacle depends on the signed distance, for any shape; ``"gaussian"``:
             Gaussian cost as in the thesis (see :mod:`~imitarm.policies.obstacle_cost`).
-        gains: stiffness K and damping D of the primitive and of the deviation: ``"critical"``, ``"thesis"`` (K =
-            139.26, D = 28) or Gains.
-        margin: additional distance that grows with the look-ahead time, such as a
-            :class:`~imitarm.perception.CoverageMargin`. None: ``min(beta sigma, cap)``, where sigma is the largest
-            standard deviation of an obstacle's observed position.
-        beta: see ``margin``.
-        cap: see ``margin`` [m].
+        gains: stiffness K and damping D of the primitive and of the deviation: ``"critical"`` (critical damping),
+            ``"thesis"`` (K = 139.26, D = 28) or Gains.
+        margin: a :class:`~imitarm.perception.CoverageMargin`: additional distance that grows with the look-ahead time.
+            None: the additional distance is ``min(beta sigma, cap)``, where sigma is the largest standard deviation of
+            an obstacle's observed position.
+        beta: factor of the standard deviation, see ``margin``.
+        cap: largest additional distance, see ``margin`` [m].
         time_constant: tau, the time constant of the deviation [s]; the thesis uses 1 s.
         max_acceleration: largest acceleration of the deviation by u, spring and damper together [m/s^2].
-        max_push: largest u [m/s^2]. A constant u leads to the deviation ``tau^2 u / K``.
-        horizon: number H of predicted instants.
-        interval: time between two predicted instants [s].
+        max_push: largest norm of u [m/s^2]. A constant u leads to the deviation ``tau^2 u / K``.
+        horizon: number H of future times for which motions are predicted.
+        interval: interval between these times [s].
         gain: feedback gain of the tool's position and rotation [1/s].
-        patience: e_0, the lag at which the phase stops [m].
-        arrival: the motion has arrived when the tool is nearer than this to the goal [m].
+        patience: distance of the tool from its commanded position at which the phase stops [m].
+        arrival: distance from the goal below which the tool has arrived [m].
         options: arguments of :class:`~imitarm.policies.Policy`.
     """
 
@@ -158,10 +159,10 @@ class RCAMO(Policy):
         self._begin(observation, 0.0)
 
     def resume(self, observation: Observation, phase: float) -> None:
-        """Go on from the measured pose of the tool, at a fraction ``phase`` of the motion, 0 to 1.
+        """Continue from the measured pose of the tool, at the phase ``phase`` of the motion, 0 to 1.
 
-        The motion is the one that began with the last :meth:`reset`. If ``reset`` was never called, it is the motion
-        from the learned start.
+        The motion is the one of the last :meth:`reset`. If ``reset`` was never called, the motion begins at the learned
+        start.
         """
         phase = finite_number(phase, "RCAMO.resume: phase", at_least=0.0, at_most=1.0)
         instance(observation, Observation, "RCAMO.resume: observation")
@@ -180,7 +181,7 @@ class RCAMO(Policy):
 
     @property
     def phase(self) -> float:
-        """Completed fraction of the motion, 0 to 1."""
+        """Phase of the motion, from 0 at the start to 1 at the end."""
         return self._phase
 
     def _followed(self, observation: Observation) -> PrimitivePath:
@@ -395,11 +396,12 @@ class RCAMO(Policy):
         return Command(twist, progress=self._phase)
 
     def cost_field(self, scene: Scene, points: ArrayLike) -> Array:
-        r"""Return the cost of the tool at points, so that it can be drawn: the cost of thesis Eq 5.1, corrected.
+        r"""Return the cost of tool positions, for drawing it (thesis Eq 5.1, corrected).
 
         .. math:: J^G(\chi) = \tfrac12 w_e\,(\chi - \xi)^T \Theta\,(\chi - \xi) + \sum_i b_i(\chi)
 
-        For each point chi, xi is the nearest point of the motion. The obstacles have their poses in the scene.
+        Here, chi is a tool position, and xi is the nearest point of the motion. The obstacles stay at their poses in
+        the scene.
 
         Args:
             scene: goal and obstacles at one time.
@@ -431,7 +433,7 @@ class RCAMO(Policy):
         return np.asarray(cost.reshape(chi.shape[:-1]))
 
     def finished(self, observation: Observation) -> bool:
-        """Return whether the phase is at its end, and the tool is nearer than ``arrival`` to the goal."""
+        """Return whether the phase is 1 and the tool is nearer than ``arrival`` to the goal."""
         if self._path is None:
             return False
         goal = self._learned_goal if observation.scene.goal is None else observation.scene.goal

@@ -1,15 +1,15 @@
-r"""The rest of a motion that has begun: it starts at the measured posture and joins the planned motion smoothly.
+r"""Remainder: the rest of a planned motion, which starts at the measured posture and joins the plan smoothly.
 
-A plan displaces the learned path :math:`x_0(t)` by :math:`B(t)\,\Delta`. At the time s, the tool is measured at the
-position x.
-The rest of the motion is again an affine function of the displacements:
+A plan displaces the learned path :math:`x_0(t)` by :math:`B(t)\,\Delta`, where :math:`\Delta` are the displacements of
+the path's components. At the time s, the measured position of the tool is x. The path of the rest of the motion is
 
 .. math:: x(t) = x_0(t) + f(t)\,\bigl(x - x_0(s) + (t - s)\,\dot B(s)\,\Delta_0\bigr)
           + \bigl(B(t) - f(t)\,(B(s) + (t - s)\,\dot B(s))\bigr)\,\Delta .
 
-Here :math:`\Delta_0` are the planned displacements, and f falls smoothly from 1 at the time s to 0. For every
-:math:`\Delta`, this path begins at x, in the planned direction of motion. If the tool is at its planned position, the
-path with :math:`\Delta = \Delta_0` is the planned path. The tilt of the tool joins the planned tilt in the same way.
+Here, :math:`\Delta_0` are the planned displacements, and f decreases smoothly from 1 at the time s to 0. For every
+:math:`\Delta`, this path begins at x and in the planned direction of motion. If the tool is at its planned position,
+the path with :math:`\Delta = \Delta_0` is the planned path. The tilt (the rotation of the tool away from the learned
+rotation) joins the planned tilt in the same way.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ _STANDING = (
 
 @dataclass(frozen=True, eq=False)
 class Remainder:
-    """The rest of a motion; it is the first guess when the motion is planned again.
+    """The rest of a planned motion, which is the first guess of a new plan.
 
     Attributes:
-        components: the rest of the path and its components; its times begin at 0.
+        components: the rest of the path with its components; its times start at 0.
         displacement: planned displacements of the components, shape (n_components, 3) [m].
-        tilts: possible tilts of the tool.
+        tilts: smooth functions of time for the tilt of the tool.
         tilt: planned coefficients of the tilts, shape (n_tilts, 3) [rad].
-        joints: planned joint positions at the samples, moved to the measured posture at the start, shape (n, n_joints)
-            [rad].
-        rate: speed along the path at the start, divided by the learned speed.
-        begins: time in the planned path at which the rest begins [s].
+        joints: planned joint positions at the samples, shape (n, n_joints) [rad]; near the start, they are shifted so
+            that the first is the measured posture.
+        rate: measured speed along the path at the start, divided by the planned speed.
+        begins: time in the learned motion at which the rest begins [s].
     """
 
     components: ComponentPath
@@ -60,7 +60,7 @@ class Remainder:
 
     @classmethod
     def of(cls, plan: ArmPlan, begins: float, state: ArmState) -> Remainder:
-        """Return the rest of a plan.
+        """Return the rest of a plan from a measured state on.
 
         Args:
             plan: a plan of the whole motion.

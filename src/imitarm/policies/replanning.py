@@ -45,43 +45,44 @@ def replan(
     max_rounds: int | None = None,
     displacement: ArrayLike | None = None,
 ) -> Adaptation:
-    """Plan the rest of a motion again, for example because an obstacle has moved.
+    """Plan the rest of a motion of the whole arm again, for example because an obstacle has moved.
 
-    The motion goes on from the measured posture, in the planned direction and with the measured speed. If possible, it
-    passes each obstacle on the same side as ``previous``. Wherever the displacement of ``previous`` keeps the
-    clearance, the motion keeps this displacement. Only the rest of the path is planned; the certificate covers it from
-    the measured posture to the goal. The plan can't choose another posture at the start, so it has no approach.
+    The new plan continues the motion from the measured posture, in the planned direction and with the measured speed.
+    If possible, it passes each obstacle on the same side as ``previous``. Where ``previous`` still keeps the clearance,
+    its displacement does not change. The guaranteed clearance covers the rest of the motion, from the measured posture
+    to the goal.
 
-    The rest begins at time 0. At that time, the obstacles are at the poses given by the scene; from then on, they move
-    with their velocities. To plan once more, pass the result as ``previous``.
+    The times of the result start at 0, now. At time 0, the obstacles are at their poses in the scene; then they move
+    with their velocities. To plan again later, pass the result as ``previous``.
 
     Args:
         previous: a feasible adaptation of the whole arm (``adapt(..., arm=...)``), or a result of this function.
-        scene: obstacles now; its goal is None, or the goal of ``previous``.
+        scene: obstacles at the current time; its goal must be None or the goal of ``previous``.
         arm: the arm with its tool.
         state: measured state of the arm.
-        phase: present time on the clock of ``previous.trajectory`` [s]. This clock starts at 0 when the approach, the
-            motion to the start of the path, has ended.
+        phase: time in ``previous.trajectory`` that the motion has reached [s]. If ``previous`` has an approach, the
+            time 0 is the end of the approach.
         clearance: required distance from the whole arm to every obstacle [m].
         forbidden: directions in which no component may move, shape (m, 3); see :func:`adapt`.
         max_tilt: largest rotation of the tool away from the learned rotation [rad]; see :func:`adapt`.
         goal_tilt: largest rotation of the tool away from the learned rotation at the goal [rad]; see :func:`adapt`.
-        allowance: additional clearance for tracking errors [m]. It is used if ``previous`` has this larger clearance
-            and a path with it is found.
+        allowance: additional clearance for tracking errors [m]. If ``previous`` or the new path does not have this
+            additional clearance, the function plans without it.
         margin: bound of the error of the predicted obstacle positions; see :func:`adapt`.
-        margin_horizon: the margin grows until this time after the obstacle was seen [s]; see :func:`adapt`.
-        hold: the whole arm must keep its clearances at the goal for this long after the arrival [s].
+        margin_horizon: time after the last detection of an obstacle at which the margin stops to grow [s]; see
+            :func:`adapt`.
+        hold: time for which the whole arm must keep its clearances at the goal after the arrival [s].
         max_attempts: largest number of attempts in the search for a joint path, to limit the computing time; None: no
-            limit. The search may also try to execute the path later, so that obstacles pass first; such attempts are
+            limit. The search may also try to execute the path later, after an obstacle has passed; such attempts are
             not counted.
-        max_rounds: largest number of rounds of the whole search. Each round improves a joint path once. This limits the
-            computing time more tightly than ``max_attempts``. None: no limit.
-        displacement: displacements of the components with which the search begins, such as those of a search that ended
-            after ``max_rounds``, shape (n_components, 3) [m]; None: those of ``previous``.
+        max_rounds: largest number of rounds of the whole search, to limit the computing time; None: no limit. In each
+            round, the planner improves a joint path once. An attempt can have many rounds.
+        displacement: first guess of the components' displacements, shape (n_components, 3) [m], for example the result
+            of a search that ended after ``max_rounds``; None: the displacements of ``previous``.
 
     Returns:
-        The adaptation of the rest of the motion; check ``feasible`` before executing it. If it is not feasible, the arm
-        must brake.
+        The adaptation of the rest of the motion. If its attribute ``feasible`` is False, do not execute it: brake the
+        arm.
 
     Raises:
         InputError: when ``previous`` has no plan of the whole arm, the motion is over, or an argument is not valid.

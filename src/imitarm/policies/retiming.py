@@ -1,19 +1,19 @@
-r"""Execution times for a joint path, from rest to rest, within the limits of velocity, acceleration and torque.
+r"""Execution times for a joint path, within the limits of velocity, acceleration and torque.
 
-Let s be the parameter of the path q(s), :math:`\dot s` its rate, :math:`b = \dot s^2` and :math:`a = \ddot s`.
-Then all limits are linear in a and b:
+Let s [s] be the parameter of the joint path q(s), and :math:`\dot s` its rate. With :math:`b = \dot s^2` and :math:`a =
+\ddot s`, the limits of acceleration and torque are linear in a and b, and the limit of velocity is a bound of b:
 
 .. math:: |q'| \sqrt b \le \dot q_{max}, \qquad |q' a + q'' b| \le \ddot q_{max}, \qquad
           |M q'\,a + (M q'' + C(q, q') q')\,b + g| \le \tau_{max}
 
-A first pass, from the end to the start, finds for each sample the largest :math:`b` from which the rest of the path can
-still be executed. A second pass, from the start to the end, takes the largest possible :math:`a` at each sample. The
-method is that of Pham and Pham, "A new approach to time-optimal path parameterization based on reachability analysis",
-IEEE T-RO 34(3), 2018.
+A first pass goes from the end of the path to its start. It finds the largest :math:`b` at each sample from which the
+arm can still execute the rest of the path. A second pass goes from the start to the end and takes the largest possible
+:math:`a` at each sample. The method was published by Pham and Pham, "A new approach to time-optimal path
+parameterization based on reachability analysis", IEEE T-RO 34(3), 2018.
 
-A *schedule* executes a path later or more slowly, so that a moving obstacle can pass first. It limits the rate ds/dt at
-each sample. A *wait* at a sample is a very slow motion from this sample to the next one. The method above then brakes
-the arm before this place and accelerates it afterwards, within all limits.
+A *schedule* delays the motion or slows it down, so that a moving obstacle can pass first. It limits the rate ds/dt at
+each sample. To wait at a sample, the arm moves very slowly from this sample to the next one. The two passes above brake
+the arm before this sample and accelerate it afterwards, within all limits.
 """
 
 from __future__ import annotations
@@ -53,12 +53,12 @@ _SLOWER = (0.75, 0.5, 0.35)  # rates of the whole motion
 
 @dataclass(frozen=True, eq=False)
 class Timing:
-    """Execution times of a path.
+    """The times at which an arm reaches the samples of a path.
 
     Attributes:
         times: time of each sample, from 0, shape (n,) [s].
-        blocked: index of the first sample at which a limit does not allow any motion; -1 if there is no such sample.
-        joint: index of the joint whose torque limit does not allow any motion; -1 if there is no such joint.
+        blocked: index of the first sample at which the limits of the arm allow no motion; -1 if there is none.
+        joint: index of the joint whose torque limit allows no motion there; -1 if there is none.
         rate: the rate ds/dt at the first sample.
     """
 
@@ -77,7 +77,7 @@ def retimed(
     path: ArmPath | None = None,
     rate: float = 0.0,
 ) -> Timing:
-    """Return the shortest execution times of a path within the limits of an arm; the motion ends at rest.
+    """Return the earliest times of the samples within the limits of an arm; the motion ends at rest.
 
     Args:
         arm: the arm with its tool.
@@ -85,9 +85,9 @@ def retimed(
         parameters: path parameter s of each sample, increasing, shape (n,) [s]. If the rate ds/dt is 1 everywhere, the
             arm reaches each sample at the time s.
         fastest: largest allowed rate ds/dt at each sample, shape (n,).
-        path: kinematics of the arm in these postures, if they are already known.
-        rate: desired rate ds/dt at the first sample. If the limits do not allow this rate, the largest allowed rate is
-            used.
+        path: kinematics of the arm in these postures; None: they are computed.
+        rate: desired rate ds/dt at the first sample; 0: the motion begins at rest. If the limits do not allow this
+            rate, the function uses the largest allowed rate.
     """
     first = np.gradient(joints, parameters, axis=0)
     second = np.gradient(first, parameters, axis=0)
@@ -112,26 +112,24 @@ def retimed(
 def safe_rates(
     around: ArmAmongObstacles, path: ArmPath, times: Array, clock: Array, allowance: float, *, tool_only: bool = False
 ) -> Array:
-    """Return the largest rate ds/dt at each sample with which no distance shrinks faster than the safety filter allows.
+    """Return the largest rate ds/dt at each sample at which the safety filter does not slow the arm down.
 
-    The distances may shrink at nine tenths of the rates that the safety filter allows
-    (:func:`~imitarm.scene.braking.shrink_rates`). The filter measures distances to the predicted positions of the
-    obstacles, so margins are left out. If an obstacle approaches a part of the arm, a slower motion would not help,
-    because the arm would still be in its way. Only the motion of the arm itself therefore limits the rate. The path and
-    its times must keep the clearance to moving obstacles.
+    The filter limits how fast each distance may shrink (:func:`~imitarm.scene.braking.shrink_rates`); this function
+    uses 90 % of these limits. The filter measures distances to the predicted positions of obstacles, so the margins do
+    not count here. If a distance shrinks because the obstacle moves towards the arm, a slower motion would not help.
+    The function therefore limits only the part of the shrinking that the arm's own motion causes.
 
     Args:
         around: the arm, its obstacles and the required clearances.
         path: the arm at n samples.
         times: path parameter s of each sample, increasing, shape (n,) [s].
-        clock: time at which the arm is expected at each sample, shape (n,) [s]; the obstacles are predicted for this
-            time.
-        allowance: required clearance minus the clearance that the safety filter keeps [m].
-        tool_only: whether to consider only the distances from obstacles to the last link with its tool. These distances
-            depend only on the pose of the tool, not on the arm's posture.
+        clock: expected time of the arm at each sample, shape (n,) [s]; it determines the positions of moving obstacles.
+        allowance: difference between the required clearance and the smaller clearance that the safety filter keeps [m].
+        tool_only: whether to consider only the distances of the last link and the tool from obstacles. These distances
+            do not depend on the posture of the other links.
 
     Returns:
-        Rates, at most 1, shape (n,).
+        The rates, each at most 1, shape (n,).
     """
     velocity = np.gradient(path.joints, times, axis=0)
     fastest_obstacle, slowest = around.fastest_obstacle, APPROACH_RATE
@@ -156,11 +154,11 @@ def safe_rates(
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """One schedule.
+    """Limits of the rate along a path that delay the motion or slow it down.
 
     Attributes:
         fastest: largest rate ds/dt at each sample, shape (n,).
-        clock: approximate time of each sample, without limits of acceleration, shape (n,) [s].
+        clock: approximate time of each sample, computed without the limits of acceleration, shape (n,) [s].
         delay: time by which the schedule delays the arrival [s].
     """
 
@@ -170,7 +168,7 @@ class Schedule:
 
 
 def schedules(times: Array, clock: Array, *, at_rest: bool) -> list[Schedule]:
-    """Return schedules for a path, the smallest delay first.
+    """Return possible schedules for a path, in the order of their delay.
 
     Args:
         times: times of the samples in the learned motion, from 0, shape (n,) [s].

@@ -1,12 +1,13 @@
-"""A roadmap of displacements over time: possible positions of the tool at each time, and connections between them.
+"""Roadmap: a graph of possible tool positions over time, in which routes around the obstacles are found.
 
-The nodes are arranged in layers. Each layer belongs to one time on the nominal path. In each layer, rays in all
-directions start at the nominal position of this time. The nodes of a ray are its points just outside the inflated
-obstacles. Edges lead from each node to the nodes of the next layer on the same and on neighbouring rays. The cost of an
-edge is the change of the displacement, plus a large amount if the two tangents at its ends do not prove the clearance.
-A narrow gap between obstacles may lie between two rays. If no route is found, a second roadmap therefore has additional
-rays that are aimed at gaps. Dynamic programming from both ends computes, for each node, the cheapest route through this
-node. A route is only a proposal: the search for the least detour takes its first tangents along the route.
+The nodes of the graph are arranged in layers. Each layer belongs to one time on the nominal path. In each layer, rays
+in all directions start at the nominal position of this time. The nodes are points on these rays, for example just
+outside the obstacles, enlarged by the required clearance. Edges lead from each node to the nodes of the next layer on
+the same ray and on neighbouring rays. The cost of an edge grows with the change of the displacement along the edge. It
+is much larger if the clearance on the edge is not proven by the tangents at its two ends
+(:mod:`~imitarm.policies.certificate`). A narrow gap between obstacles may lie between two rays. If there is no route, a
+second roadmap therefore has additional rays that are aimed at gaps. Dynamic programming from both ends computes the
+cheapest route through each node. A route is only a proposal, along which the search for the least detour begins.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ _BLOCKED = 1e9
 
 
 class Roadmap:
-    """Nodes, edges and the cheapest routes among one set of obstacles.
+    """The graph among one set of obstacles, and its cheapest routes.
 
     Args:
         path: the nominal path and its components.
@@ -60,8 +61,8 @@ class Roadmap:
 
     Attributes:
         layers: index of the path's sample at each layer, shape (n_layers,).
-        nodes: displacement of each node from the nominal position, shape (n_layers, n_nodes, 3) [m]; node 0 is the
-            nominal position.
+        nodes: displacement of each node from the nominal position, shape (n_layers, n_nodes, 3) [m]. Node 0 of each
+            layer is the nominal position.
     """
 
     def __init__(
@@ -91,8 +92,8 @@ class Roadmap:
     def routes(self, n: int) -> Iterator[Array]:
         """Yield up to ``n`` routes as displacements of the tip at all samples (n_samples, 3) [m], cheapest first.
 
-        Each further route passes through a new node in the layer in which the previous routes came closest to an
-        obstacle.
+        All routes after the first one pass through different nodes of one layer: the layer in which the first route has
+        its largest cost.
         """
         through = self._forward[0] + self._backward[0]
         used: list[Array] = []
@@ -324,7 +325,7 @@ class Roadmap:
 
     @property
     def is_hopeless(self) -> bool:
-        """Whether the roadmap has no useful route: no route at all, or only routes with far too little clearance."""
+        """Whether the roadmap has no route, or its cheapest route comes much too close to an obstacle."""
         if not self._forward[0][-1, 0] < _BLOCKED:
             return True
         edges = self._edges_of(self._through(len(self.layers) - 1, 0))

@@ -1,4 +1,4 @@
-"""StagedPolicy: several motions one after another, with gripper commands between them, such as picking and placing."""
+"""StagedPolicy: several motions one after another, with gripper commands in between, for example to pick and place."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ _RETRY = 0.2  # [s] after which a stage that could not start is tried again
 
 
 def learned_goal(scene: Scene) -> Pose | None:
-    """Return the goal of the scene; None stands for the learned goal."""
+    """Return the goal of the scene; None: the learned goal."""
     return scene.goal
 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """One motion of a :class:`StagedPolicy`, and what the gripper does at its end.
+    """One motion of a :class:`StagedPolicy`, and the motion of the gripper after it.
 
     Attributes:
-        name: name of the stage in messages.
+        name: name of the stage, for messages.
         policy: policy that makes the motion.
-        goal: function that returns the goal of the motion (tool_to_base) in an observed scene. The function is called
-            in every control step, so the goal may follow an object. The default is the goal of the scene.
-        opening: opening to which the gripper's fingers move after the motion [m]; None: unchanged.
+        goal: function that gets the observed scene and returns the goal of the motion (tool_to_base). The policy calls
+            it in every control step, so the goal can follow an object. The default returns the goal of the scene.
+        opening: distance between the gripper's fingers after the motion [m]; None: unchanged.
         hold: time for which the arm stands still after the motion, while the fingers move [s].
     """
 
@@ -53,13 +53,13 @@ class Stage:
 class StagedPolicy(Policy):
     """Makes several motions one after another, for example to pick an object and to place it.
 
-    Each stage has its own policy. When the motion of a stage has arrived, the gripper moves to its new opening, and the
-    arm stands still for the hold time. Then the next stage begins at the measured pose. The policy of a stage may
-    refuse to start, for example because an obstacle stands on the goal. The arm then waits, and tries the stage again
-    every 0.2 s. Only a refusal of the first stage is an error, because nothing has moved yet.
+    Each stage has its own policy. When the tool has arrived at the goal of a stage, the gripper opens or closes, and
+    the arm stands still for the time ``hold``. Then the next stage begins at the measured pose. The policy of a stage
+    may refuse to start, for example because an obstacle is at the goal. If this is the first stage, ``reset`` raises an
+    error. Otherwise, the arm waits, and the stage is tried again every 0.2 s.
 
     Args:
-        stages: the motions, at least one.
+        stages: the stages in the order of their execution, at least one.
 
     Raises:
         InputError: when there is no stage.
@@ -75,19 +75,19 @@ class StagedPolicy(Policy):
 
     @property
     def plan(self) -> Any:
-        """Plan of the current stage."""
+        """Plan of the current stage's policy."""
         return self.stage.policy.plan
 
     @property
     def stage(self) -> Stage:
-        """The present stage."""
+        """The current stage."""
         return self.stages[self._index]
 
     def reset(self, observation: Observation) -> None:
         """Begin the first stage.
 
         Raises:
-            InfeasibleError: when the first stage refuses.
+            InfeasibleError: when the policy of the first stage refuses to start.
         """
         self._begin(0)
         self.stage.policy.reset(self._seen(observation))

@@ -1,13 +1,13 @@
-r"""certified_stop: brake a moving arm to rest and hold it at rest, with a certificate for the whole motion.
+r"""certified_stop: a motion that brakes an arm to rest and holds it, with a guarantee of its clearance.
 
-All joints brake in the same time, each with a constant deceleration. The joint that needs longest determines this time.
-In joint space, the arm therefore moves on a straight line. It stops after the time
+All joints brake with constant decelerations and stop at the same time, so the arm moves on a straight line in joint
+space. The joint that needs the longest time determines the braking time
 
 .. math:: t_b = \max_j \frac{|\dot q_j|}{a_j} .
 
-Here, :math:`\dot q_j` is the velocity of joint j and :math:`a_j` its acceleration limit. The arm keeps the posture in
-which it stops until the end of the horizon. The certificate of the whole arm (:mod:`~imitarm.policies.arm_certificate`)
-covers both parts.
+Here, :math:`\dot q_j` is the velocity of joint j, and :math:`a_j` is 80 % of its acceleration limit. After the braking,
+the arm keeps its posture until the end of the horizon. The guarantee (:mod:`~imitarm.policies.arm_certificate`) covers
+the braking and the time at rest.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ _STANDS = 1e-4  # [rad/s]
 
 @dataclass(frozen=True, eq=False)
 class Stop:
-    """A motion that ends at rest, and its certificate.
+    """A motion that ends at rest, and its guaranteed clearance.
 
     Attributes:
         times: times of the samples, from 0 to the end of the horizon, shape (n,) [s].
         joints: joint positions, shape (n, n_joints) [rad]; linear between the samples.
-        clearance: guaranteed lower bound of the clearance of the whole arm [m], or, if ``certified`` is False, a
-            measured clearance that is too small.
+        clearance: guaranteed lower bound of the clearance of the whole arm [m]. If ``certified`` is False, this is a
+            clearance below the required one that was measured at one point of the motion.
         certified: whether the whole arm keeps its clearances until the end of the horizon.
-        reason: names the parts that come too close to each other; empty if ``certified``.
+        reason: text that names the link and the object that come too close to each other; empty if ``certified``.
     """
 
     times: Array
@@ -65,7 +65,7 @@ def certified_stop(
     margin: CoverageMargin | None = None,
     margin_horizon: float | None = None,
 ) -> Stop:
-    """Return the motion that brakes the arm to rest and holds it, with its certificate.
+    """Return the motion that brakes the arm to rest and holds it there, with its guaranteed clearance.
 
     Args:
         arm: the arm with its tool.
@@ -73,9 +73,9 @@ def certified_stop(
         scene: the observed obstacles with their velocities, and the fixtures. If a part of the arm is already nearer to
             a fixture than ``clearance``, it may stay at this distance.
         clearance: required distance from the whole arm to every obstacle [m].
-        horizon: the certificate holds from now until this time has passed [s].
+        horizon: time from now for which the clearance must be guaranteed [s].
         margin: bound of the error of the predicted obstacle positions; see :func:`~imitarm.policies.adapt`.
-        margin_horizon: see :func:`~imitarm.policies.adapt` [s].
+        margin_horizon: time after the last detection of an obstacle at which the margin stops to grow [s]; None: never.
 
     Raises:
         InputError: when an argument is not valid.

@@ -1,4 +1,4 @@
-"""Tilts: smooth rotations of the tool away from its learned rotation, and the splines that describe them."""
+"""Tilts: smooth functions of time for the rotation of the tool away from its learned rotation."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ _KNOTS = 8
 
 @dataclass(frozen=True, eq=False)
 class Tilts:
-    r"""All tilts that a plan can choose from.
+    r"""The rotations away from the learned rotation (tilts) that a plan can choose.
 
-    A tilt is a rotation vector as a function of time: a fixed part and a sum of smooth functions,
-    :math:`\tau(t) = \tau_0(t) + \sum_k B_k(t)\,c_k`. The planner chooses the coefficients :math:`c_k`. The rotation
-    vector is applied to the learned rotation, in the base frame.
+    A tilt is a rotation vector in the base frame that depends on time: :math:`\tau(t) = \tau_0(t) + \sum_k
+    B_k(t)\,c_k`. The functions :math:`B_k` are splines, and the planner chooses their coefficients :math:`c_k`. The
+    rotation vector is applied to the learned rotation of the tool.
 
     Attributes:
-        basis: the functions B at the samples, shape (n, n_tilts).
-        fixed: the fixed part at the samples, shape (n, 3) [rad].
+        basis: the functions B_k at the samples, shape (n, n_tilts).
+        fixed: the part tau_0 at the samples, which the planner can't change, shape (n, 3) [rad].
     """
 
     basis: Array
@@ -34,19 +34,19 @@ class Tilts:
 
     @classmethod
     def between_ends(cls, times: Array, *, tilted_goal: bool, window: Array | None = None) -> Tilts:
-        """Return tilts that are zero at the start; they are also zero at the goal unless ``tilted_goal`` is True.
+        """Return tilts that are zero at the start and, if ``tilted_goal`` is False, at the goal.
 
         Args:
             times: n increasing times [s].
             tilted_goal: whether the tool may be tilted at the goal.
-            window: factors by which all tilts are multiplied, shape (n,); None: all are 1.
+            window: factor of all tilts at each sample, shape (n,); None: 1.
         """
         basis = splines(times, _KNOTS, first=False, last=tilted_goal)
         return cls(basis if window is None else window[:, None] * basis, np.zeros((len(times), 3)))
 
     @property
     def n_tilts(self) -> int:
-        """Number of smooth functions, which is also the number of rows of the coefficients."""
+        """Number of functions B_k, which is also the number of rows of the coefficients."""
         return self.basis.shape[1]
 
     def vectors(self, coefficients: Array, samples: Index | slice = slice(None)) -> Array:

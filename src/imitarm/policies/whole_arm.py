@@ -1,18 +1,19 @@
-"""Search for a joint path on which the whole arm keeps its clearance, as close to the demonstration as possible.
+"""Search for a joint path on which the whole arm keeps its clearance and follows the demonstration closely.
 
-The search makes the following attempts in turn. Each attempt keeps more of the demonstrated motion than the next one:
+The search tries the following plans in turn, until one keeps the clearance. The first ones change the demonstrated
+motion least:
 
-1. the detour planned for the tool alone, with the self-motion of the arm and the allowed tilt of the tool;
+1. the path planned for the tool alone, with changes of the arm's posture and with the allowed tilt of the tool;
 2. another posture of the arm at the goal;
 3. narrower components, which can bend the path more sharply;
 4. the path on another side of the obstacle, or farther away from it;
-5. another posture at the start, if the arm can reach it by a clear motion before the motion of the skill begins;
-6. the best failed attempts again, with narrower components.
+5. another posture at the start, if a collision-free motion leads to this posture first;
+6. the best failed plans again, with narrower components.
 
-If a plan takes much longer than the learned motion, the search makes a few more attempts and returns the plan that
-takes the least time. If the tool itself must pass an obstacle slowly, no other posture helps, so the search tries only
-other paths of the tool. If no attempt succeeds, the reason states which link and obstacle come too close in the best
-attempt, and at which time.
+If a plan takes much longer than the learned motion, the search makes a few more attempts and returns the fastest plan.
+If the plan is slow because the tool passes close to an obstacle, the search tries only other paths of the tool, because
+other postures would not help. If no attempt succeeds, the reason names the link and the obstacle that come too close in
+the best attempt, and the time.
 """
 
 from __future__ import annotations
@@ -63,12 +64,12 @@ _LEVER = 0.05  # squared influence of the components; a place with less is not m
 
 
 def solve(task: ArmTask, path: ComponentPath, displacement: Array) -> ArmSolution:
-    """Find a joint path that moves the tool along a skill's path and around the obstacles.
+    """Find a joint path on which the tool follows a skill's path and the whole arm avoids the obstacles.
 
     Args:
-        task: the arm and its surroundings.
+        task: the arm, its obstacles and the limits of the plan.
         path: the path of the tool and its components.
-        displacement: first guess of the components' displacements, for example from the detour of the tool alone, shape
+        displacement: first guess of the components' displacements, for example from a plan of the tool alone, shape
             (n_components, 3) [m].
     """
     search = _Search(task, path, displacement)
@@ -491,5 +492,5 @@ class _Search:
 
 @lru_cache(maxsize=16)
 def links_apart(arm: ArmModel) -> SelfClearance:
-    """Return the clearance between links that a plan keeps for this arm."""
+    """Return the pairs of links of an arm that must stay apart, with the clearance that plans keep between them."""
     return SelfClearance(arm, SELF_CLEARANCE)
