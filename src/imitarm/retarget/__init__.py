@@ -1,6 +1,6 @@
 """Retargeting: convert the motion of a human arm to the motion of a robot arm.
 
-:data:`RETARGETERS` lists the built-in methods and the methods of other packages.
+The registry :data:`RETARGETERS` contains the methods of this package and of other packages.
 """
 
 from imitarm.registry import Registry
@@ -21,10 +21,10 @@ RETARGETERS: Registry[type[Retargeter]] = Registry(
         "m3": "imitarm.retarget.baselines.incremental_ik:IncrementalIK",
     },
 )
-"""All methods by name.
+"""Registry of all retargeting methods: the class of each method by its name.
 
-Other packages add methods under the entry-point group ``imitarm.retargeters``.
-Methods of other packages then appear in all commands that take a retargeting method, and in the reports.
+Another package adds a method by an entry point of the group ``imitarm.retargeters``. The method then appears in all
+commands that take a retargeting method, and in their reports.
 """
 
 __all__ = [

@@ -30,15 +30,15 @@ class ArmEstimate(NamedTuple):
     """Smoothed pose and motion of a person's arm with the true bone lengths, in the robot's base frame.
 
     Attributes:
-        time: time of the frame, on the source's clock [s].
+        time: time of the frame, on the clock of the camera or recording [s].
         shoulder: position of the shoulder, shape (3,) [m].
         elbow: position of the elbow, shape (3,) [m].
         wrist: position of the wrist, shape (3,) [m].
         velocities: velocities of shoulder, elbow and wrist, shape (3, 3) [m/s].
         hand: rotation of the hand, quaternion wxyz, shape (4,): x along the hand, z out of the back of the hand.
         angular_velocity: angular velocity of the hand, shape (3,) [rad/s].
-        confidence: confidences of elbow, wrist and hand rotation, each 0 to 1.
-        closed: whether the hand is closed; None while this is unknown.
+        confidence: confidences of the elbow position, the wrist position and the hand rotation, each 0 to 1.
+        closed: whether the hand is closed; None if this is not known.
     """
 
     time: float
@@ -64,17 +64,19 @@ class ArmEstimate(NamedTuple):
 
 
 class ArmEstimator:
-    """Converts skeletons to an :class:`ArmEstimate`: removes outliers, corrects bone lengths, and smooths.
+    """Computes an :class:`ArmEstimate` from each skeleton: removes outliers, corrects bone lengths, and smooths.
 
-    All retargeting methods use this estimator, so its filtering does not affect a comparison of the methods.
+    All retargeting methods use this estimator, so that a comparison of the methods does not depend on different
+    filters.
 
     Args:
-        correspondence: object that states the side of the person's arm and the pose of the sensor.
-        smoothing: whether to apply the One-Euro filter and to remove jumps that occur when the tracking state changes
-            (:class:`~imitarm.retarget.smoothing.TrackingOffsets`); otherwise, the points with corrected bone lengths
-            are returned unfiltered.
-        limbs: how the bone lengths are corrected: ``"fit"``: by the smallest change of all three points;
-            ``"direction"``: from the shoulder outwards, as in the thesis, so that the bones keep their directions.
+        correspondence: the side of the person's arm, its bone lengths if known, and the pose of the sensor.
+        smoothing: whether to apply the One-Euro filter, and to remove jumps that occur when the camera loses or finds a
+            joint (:class:`~imitarm.retarget.smoothing.TrackingOffsets`). If False, only outliers are removed and bone
+            lengths corrected.
+        limbs: how the bone lengths are corrected. ``"fit"``: by the smallest change of shoulder, elbow and wrist.
+            ``"direction"``: as in the thesis, by a change of elbow and wrist with which the bones keep their
+            directions.
     """
 
     def __init__(
@@ -95,7 +97,7 @@ class ArmEstimator:
         self.reset()
 
     def reset(self) -> None:
-        """Delete everything that was learned from previous frames."""
+        """Delete all information from previous frames."""
         self._time = self._used = -np.inf
         self._hand: Array | None = None
         self._fore: Array | None = None
@@ -107,7 +109,7 @@ class ArmEstimator:
             one.reset()
 
     def update(self, skeleton: Skeleton) -> ArmEstimate | None:
-        """Return the estimate from the next skeleton; None if it shows no usable arm or is not newer than the last."""
+        """Return the estimate from a skeleton; None if it shows no usable arm or is not newer than the last one."""
         if skeleton.time <= self._time:
             return None
         self._time = skeleton.time

@@ -1,4 +1,4 @@
-"""Calibration: measurements of a person, a sensor and a robot, made once and saved in a file."""
+"""Calibration: measurements of a person's arm and of the sensor's pose, saved in a file."""
 
 from __future__ import annotations
 
@@ -40,19 +40,19 @@ _WORTH = 0.005  # [m] RMS residual below which no pair is suspect
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Measurements of a person and a sensor; a value that was not measured is None.
+    """Measurements of a person's arm and of a sensor; a value that was not measured is None.
 
     Attributes:
         side: side of the measured arm, ``"left"`` or ``"right"``.
         lengths: bone lengths of this arm.
         sensor_to_base: pose of the sensor in the robot's base frame.
-        sensor_rms: RMS residual of the sensor's pose [m].
+        sensor_rms: root mean square error of the points from which the pose of the sensor was computed [m].
         scale: motion of the tool divided by the motion of the hand; None: 1.
-        orientation: how the tool rotates with the hand (see :class:`~imitarm.retarget.correspondence.Correspondence`);
-            if this is None, the tool rotates exactly like the hand.
+        orientation: how the tool rotates with the hand, see :class:`~imitarm.retarget.correspondence.Correspondence`;
+            None: the tool rotates like the hand.
 
     Raises:
-        InputError: when a value is not usable.
+        InputError: when a value is out of range or has the wrong type.
     """
 
     side: str = "right"
@@ -68,7 +68,7 @@ class Calibration:
             raise InputError(f"Calibration: sensor_rms must be a finite length [m], got {self.sensor_rms!r}")
 
     def correspondence(self) -> Correspondence:
-        """Return the correspondence, with default values for everything that was not measured."""
+        """Return a correspondence with the measured values, and with default values for all others."""
         return Correspondence(
             self.side,
             FACING if self.sensor_to_base is None else self.sensor_to_base,
@@ -78,7 +78,7 @@ class Calibration:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write the calibration as readable JSON; the file is replaced only when the new one is complete.
+        """Write the calibration as JSON; an existing file is replaced only when the new file is complete.
 
         Raises:
             InputError: when the file can't be written; an existing file is then unchanged.
@@ -231,7 +231,7 @@ def _sensor(content: Mapping[str, Any]) -> tuple[Pose | None, float | None]:
 
 
 def robot_reach(arm: ArmModel) -> float:
-    """Return the largest distance between a robot's wrist and its shoulder [m], found by a search over the joints.
+    """Return the largest distance between a robot's wrist and its shoulder [m], from a search over the joint positions.
 
     Raises:
         InputError: when the arm's file does not define shoulder and wrist.
@@ -256,14 +256,14 @@ def robot_reach(arm: ArmModel) -> float:
 
 
 def suggested_scale(arm: ArmModel, lengths: LimbLengths, anchor: Anchor = "shoulder") -> float:
-    r"""Return a suitable scale for this robot and this person (docs/capture.md).
+    r"""Return a suitable ratio of the tool's to the hand's displacement, for a robot and a person (docs/capture.md).
 
     Args:
         arm: arm of the robot.
         lengths: bone lengths of the person's arm.
-        anchor: what determines the scale. With ``"shoulder"``, the scale is the ratio of the two arms' reaches,
-            :math:`\rho = reach_{robot} / reach_{human}`, so that the person can use the robot's whole workspace. With
-            ``"object"``, the scale is 1, because the robot handles objects of the same size as the person's.
+        anchor: what determines the scale. With ``"shoulder"``, the scale is the reach of the robot's arm divided by the
+            reach of the person's arm, so that the person can use the robot's whole workspace. With ``"object"``, the
+            scale is 1, because robot and person handle objects of the same size.
     """
     return 1.0 if anchor == "object" else robot_reach(arm) / lengths.reach
 
@@ -275,9 +275,9 @@ class SensorFit:
     Attributes:
         sensor_to_base: pose of the sensor in the robot's base frame.
         residuals: distance between the two points of each pair after the fit, shape (n,) [m].
-        condition: ratio of the first to the second singular value of the points' cross-covariance H; 1 if the points
-            are spread equally in all directions, large if they lie almost on a line.
-        angle_error: standard error of the rotation about its least certain axis [rad].
+        condition: first singular value of the points' cross-covariance H, divided by the second. It is large if the
+            points lie almost on a line, so that the rotation is uncertain.
+        angle_error: standard error of the rotation about the axis with the largest uncertainty [rad].
         flat: whether the points lie in a plane, so that a mirrored axis can't be detected.
         suspect: index, from 0, of the pair that does not fit the other pairs; None: all pairs fit.
     """
@@ -298,12 +298,12 @@ class SensorFit:
     def accepted(self) -> bool:
         """Whether the fit is good enough for teleoperation.
 
-        A fit is good enough if its RMS residual is at most 2 cm and every pair of points fits the others.
+        A fit is good enough if the root mean square of the residuals is at most 2 cm and no pair is ``suspect``.
         """
         return self.rms <= GOOD and self.suspect is None
 
     def notes(self) -> list[str]:
-        """Return remarks for the user, one line each."""
+        """Return advice for the user, one line for each problem of the fit."""
         lines = []
         if self.flat:
             lines.append(
@@ -324,23 +324,24 @@ class SensorFit:
 
 
 def fit_sensor_to_base(sensor: ArrayLike, base: ArrayLike, weights: ArrayLike | None = None) -> SensorFit:
-    r"""Fit the pose of the sensor to points given in both frames (Kabsch 1976, Umeyama 1991).
+    r"""Compute the pose of the sensor from points that are known in both frames (Kabsch 1976, Umeyama 1991).
 
     .. math::
         H = \sum_i c_i (k_i - \bar k)(b_i - \bar b)^T = U S V^T, \quad
         R = V\,\mathrm{diag}(1, 1, \det V U^T)\,U^T, \quad t = \bar b - R \bar k
 
-    where H is the weighted cross-covariance of the points k (sensor) and b (base). No scale is fitted, because both
-    frames are in metres and a scale would only hide a wrong unit.
+    Here, H is the weighted cross-covariance of the points :math:`k_i` in the sensor's frame and :math:`b_i` in the base
+    frame. R and t are the rotation and the translation from sensor to base. No scale is fitted, because a scale would
+    hide a wrong unit of length.
 
     Args:
-        sensor: points k in the sensor's frame, as the sensor measured them, shape (n, 3) [m].
-        base: the same points b in the robot's base frame, shape (n, 3) [m].
-        weights: weight c of each pair, shape (n,); None: equal weights.
+        sensor: points :math:`k_i` as the sensor measured them, in the sensor's frame, shape (n, 3) [m].
+        base: the same points :math:`b_i` in the robot's base frame, shape (n, 3) [m].
+        weights: weights :math:`c_i` of the pairs of points, shape (n,); None: equal weights.
 
     Raises:
-        InputError: when there are fewer than four pairs of points, when the points are not finite, lie on a line or lie
-            too close together, or when no rigid motion maps one set of points to the other; the message says what to
+        InputError: when there are fewer than four pairs, when a point is not finite, when the points lie on a line or
+            too close together, or when no rigid motion maps one set of points to the other. The message says what to
             do.
     """
     k, b, c = _checked(sensor, base, weights)

@@ -1,4 +1,4 @@
-"""Correspondence: which arm the robot follows, the pose of the sensor, the scale, and how the tool rotates."""
+"""Correspondence: which arm the robot follows, and how the motion of the hand is mapped to the tool."""
 
 from __future__ import annotations
 
@@ -26,25 +26,26 @@ The robot's x axis points in the person's forward direction, its y axis to the p
 
 @dataclass(frozen=True, eq=False)
 class Correspondence:
-    r"""How the person's arm motion is mapped to the robot's tool.
+    r"""How the motion of a person's arm is mapped to the robot's tool.
 
-    While the robot follows the person, the tool repeats the displacement of the hand since the robot began to follow
-    (docs/retargeting.md):
+    While the robot follows the person, the tool repeats the displacement and the rotation of the hand since the time at
+    which the robot began to follow (docs/retargeting.md):
 
     .. math:: p_d = p_{home} + \rho\, R\,(W - W_0), \qquad R_d = R\,(R_H R_{H,0}^T)\,R^T R_{home}
 
-    where :math:`p_d, R_d` is the desired pose of the tool, R the rotation from sensor to base, :math:`\rho` the scale,
-    W the position of the wrist and :math:`R_H` the rotation of the hand, both in the sensor's frame. At the time when
-    the robot began to follow, the wrist was at :math:`W_0`, the hand had the rotation :math:`R_{H,0}`, and the tool had
-    the pose :math:`p_{home}, R_{home}`.
+    Here, :math:`p_d, R_d` is the desired pose of the tool, R is the rotation from sensor to base, and :math:`\rho` is
+    the scale. In the sensor's frame, W is the position of the wrist and :math:`R_H` the rotation of the hand. When the
+    robot began to follow, the wrist was at :math:`W_0`, the hand had the rotation :math:`R_{H,0}`, and the tool had the
+    pose :math:`p_{home}, R_{home}`.
 
     Attributes:
         side: side of the person's arm that the robot follows, ``"left"`` or ``"right"``.
-        sensor_to_base: pose of the sensor in the robot's base frame; only its rotation affects the motion of the tool.
+        sensor_to_base: pose of the sensor in the robot's base frame. The motion of the tool depends only on the
+            rotation of this pose.
         lengths: bone lengths of the person's arm; None: they are measured in the first frames.
         scale: :math:`\rho`, displacement of the tool divided by the displacement of the wrist.
-        orientation: how the tool rotates: ``"hand"``: like the hand; ``"upright"``: like the hand, but only about the
-            vertical, so that a tool that points down keeps pointing down; ``"fixed"``: not at all.
+        orientation: how the tool rotates. ``"hand"``: like the hand. ``"upright"``: with the hand's rotation about the
+            vertical only, so that a tool that points down always points down. ``"fixed"``: not at all.
 
     Raises:
         InputError: when a value has the wrong type or is out of range.
@@ -66,12 +67,13 @@ class Correspondence:
         object.__setattr__(self, "scale", scale)
 
     def engage(self, wrist: ArrayLike, hand: Array, tool_to_base: Pose) -> Clutch:
-        """Return the clutch of an engagement that begins with the given poses of hand and tool.
+        """Return the clutch for a robot that begins to follow the person now, at these poses of hand and tool.
 
         Args:
             wrist: wrist position in the base frame, shape (3,) [m].
             hand: hand rotation in the base frame, quaternion wxyz, shape (4,).
-            tool_to_base: pose of the tool in the base frame; its position as measured, its rotation as last commanded.
+            tool_to_base: pose of the tool in the base frame, with the measured position and the last commanded
+                rotation.
         """
         return Clutch(self, np.array(wrist, dtype=float), np.array(hand, dtype=float), tool_to_base)
 

@@ -1,4 +1,4 @@
-"""Engagement: the state machine, the same for all methods, that decides when the robot follows a person."""
+"""Engagement: the state machine that decides when the robot follows a person; all methods use it."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ LONGEST_GAP = 0.1  # [s] between two estimates; a longer gap restarts that count
 class EngagementState(StrEnum):
     """State of the engagement; each member equals its value, so ``state == "following"`` works.
 
-    * ``WAITING``: the robot is at rest until the camera has seen the person's arm for half a second.
+    * ``WAITING``: the robot waits at rest until the camera has seen the person's arm for half a second.
     * ``FOLLOWING``: the camera sees the person's arm, and the tool follows the hand.
-    * ``COASTING``: the camera has just lost the arm; the motion of the hand is extrapolated.
-    * ``HOLDING``: the arm has been lost for longer than the extrapolation lasts; the robot holds its last target.
-    * ``STOPPED``: the time for holding the target is over, and the robot brakes. The state becomes ``WAITING`` when the
-      robot is at rest and the camera sees the arm again.
+    * ``COASTING``: the camera has lost the arm for a short time; the motion of the hand is extrapolated.
+    * ``HOLDING``: the camera has lost the arm for a longer time; the target of the tool stays at its last pose.
+    * ``STOPPED``: the camera has lost the arm for too long, and the robot brakes. When the robot is at rest and the
+      camera sees the arm again, the state becomes ``WAITING``.
     """
 
     WAITING = "waiting"
@@ -38,7 +38,7 @@ class EngagementState(StrEnum):
 
     @property
     def engaged(self) -> bool:
-        """Whether the robot follows the person; also true while tracking is lost for a short time."""
+        """Whether the robot follows the person: true for ``FOLLOWING``, ``COASTING`` and ``HOLDING``."""
         return self in _ENGAGED
 
 
@@ -46,7 +46,7 @@ _ENGAGED = frozenset({EngagementState.FOLLOWING, EngagementState.COASTING, Engag
 
 
 def engaged_samples(states: ArrayLike) -> NDArray[np.bool_]:
-    """Return whether the robot follows the person in each sample of a run, shape (n,) bool.
+    """Return whether the robot follows the person in each sample of a run, shape (n,).
 
     Args:
         states: states of the run, values of :class:`EngagementState`, shape (n,).
@@ -56,14 +56,14 @@ def engaged_samples(states: ArrayLike) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class EngagementRule:
-    """Times at which the engagement changes its state, all in seconds.
+    """Times after which the state of the engagement changes, all in seconds.
 
     Attributes:
         seen_for: time for which the person's arm must be visible before the robot follows it.
-        follow_until: FOLLOWING ends this long after the arm was last seen; the delay bridges frames that a camera
-            drops.
-        coast_until: COASTING ends this long after the arm was last seen.
-        hold_until: HOLDING ends this long after the arm was last seen; inf: the robot never stops.
+        follow_until: time since the arm was last seen at which FOLLOWING ends; shorter gaps between frames have no
+            effect.
+        coast_until: time since the arm was last seen at which COASTING ends.
+        hold_until: time since the arm was last seen at which HOLDING ends; inf: HOLDING does not end.
     """
 
     seen_for: float = SEEN_FOR
@@ -77,8 +77,9 @@ class Engagement:
 
     The state changes as follows:
 
-    * From ``WAITING`` to ``FOLLOWING``: the camera has seen the arm for 0.5 s.
-    * From ``FOLLOWING`` to ``COASTING``, ``HOLDING`` and ``STOPPED``, one after another: the arm stays lost.
+    * From ``WAITING`` to ``FOLLOWING``: the camera has seen the arm for the time ``seen_for``, and :meth:`engage` is
+      called.
+    * From ``FOLLOWING`` to ``COASTING``, then ``HOLDING``, then ``STOPPED``: the camera does not see the arm.
     * From ``COASTING`` or ``HOLDING`` back to ``FOLLOWING``: the camera sees the arm again.
     * From ``STOPPED`` to ``WAITING``: the robot is at rest, and the camera sees the arm again.
 
@@ -89,9 +90,9 @@ class Engagement:
 
     Attributes:
         state: the current state.
-        clutch: the poses of hand and tool when the robot began to follow the person; None while the robot follows
-            nobody.
-        ready: whether the robot may begin to follow the person in this control period; the caller then calls
+        clutch: the poses of hand and tool when the robot began to follow the person; None while the robot follows no
+            person.
+        ready: whether the robot may begin to follow the person in this control period. If True, the caller calls
             :meth:`engage`.
         time_since_seen: time since the person's arm was last seen [s]; inf if it was never seen.
     """
@@ -116,8 +117,8 @@ class Engagement:
             estimate: estimate of the person's arm from a new frame; None: there is no new frame, or it does not show
                 the arm.
             period: time since the last call [s].
-            at_rest: whether the robot is at rest; only then may it begin to follow a person. The time for which the
-                arm has been visible is also counted while the robot moves.
+            at_rest: whether the robot is at rest. If it is not, it can't begin to follow a person, but the time for
+                which the arm has been visible counts.
         """
         self.time_since_seen = self.time_since_seen + period if estimate is None else 0.0
         self.ready = False

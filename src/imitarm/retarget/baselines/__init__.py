@@ -1,1 +1,1 @@
-"""The thesis's method and the baselines M1 to M3, with the modules that only these methods use."""
+"""Retargeting methods for comparison: the thesis's method, and the thesis's baselines M1 to M3."""

@@ -38,8 +38,8 @@ _GRIP = 0.2  # [s] in which the closure follows a closing hand
 class JointPlant:
     """A MuJoCo simulation of a robot arm that a joint controller moves. It includes gravity, but no contacts.
 
-    The simulation includes rotor inertia, viscous damping and dry friction of the joints. ``ArmModel`` includes neither
-    rotor inertia nor friction, so a controller that uses an ``ArmModel`` does not account for them.
+    The simulation includes rotor inertia, viscous damping and dry friction of the joints. ``ArmModel`` contains only
+    the rigid links, so a controller with an ``ArmModel`` does not know these effects.
 
     Args:
         arm: arm model to simulate.
@@ -89,7 +89,7 @@ class JointPlant:
 
     @property
     def energy(self) -> float:
-        """Kinetic plus potential energy of the arm at the start of the last step [J]."""
+        """Kinetic plus potential energy of the arm at the start of the last simulation step [J]."""
         return float(self._data.energy.sum())
 
     def step(self, torque: Array) -> None:
@@ -103,8 +103,8 @@ class Torques:
     """Joint torques of one control period.
 
     Attributes:
-        wanted: torques that the control law computes, before any limit, shape (n_joints,) [N m].
-        applied: the same torques, limited to the rated torques of the joints, shape (n_joints,) [N m].
+        wanted: torques of the control law without limits, shape (n_joints,) [N m].
+        applied: these torques, limited to the rated torques of the joints, shape (n_joints,) [N m].
     """
 
     wanted: Array
@@ -114,9 +114,10 @@ class Torques:
 class AdaptiveLaw:
     r"""A discrete-time adaptive joint controller (baseline M2).
 
-    Let q be the joint positions, :math:`q_r` the reference, :math:`e = q - q_r` the error and T the control period.
-    With :math:`\dot e = (e - e_{k-1})/T`, :math:`\varepsilon = \dot e + \kappa e`, :math:`\dot q_e = \dot q_r - \kappa
-    e`, and :math:`\ddot q_e` from the differences of :math:`\dot q_e`, the torque is
+    Let q be the joint positions, :math:`q_r` the desired joint positions (the reference), :math:`e = q - q_r` the error
+    and T the control period. With :math:`\dot e = (e - e_{k-1})/T`, :math:`\varepsilon = \dot e + \kappa e`,
+    :math:`\dot q_e = \dot q_r - \kappa e`, and :math:`\ddot q_e` from the differences of :math:`\dot q_e`, the torque
+    is
 
     .. math::
         u = M(q)\,\ddot q_e + C(q, \dot q)\,\dot q_e + G(q) - \Gamma\varepsilon - F - K e - D \dot e
@@ -128,24 +129,25 @@ class AdaptiveLaw:
         K \leftarrow [K + Q_K(\varepsilon e - \gamma K)]_{K_{min}}^{K_{max}(h)}, \quad
         D \leftarrow [D + Q_D(\varepsilon\dot e - \gamma D)]_0^{D_{max}}
 
-    where the forgetting factor is :math:`\gamma = a/(1 + b|\varepsilon|^2)`. The closure h of the person's hand (0
-    open, 1 closed) raises the largest stiffness: :math:`K_{max}(h) = K_{lo} + h(K_{hi} - K_{lo})`. All other symbols
-    (:math:`\kappa, \Gamma, Q_F, Q_K, Q_D, a, b, K_{lo}, K_{hi}, D_{max}`) are constant gains. The inertia matrix M, the
-    Coriolis matrix C and the gravity torque G are those of the rigid arm in ``ArmModel``. The adapted values F, K and D
-    compensate for rotor inertia and friction, which the rigid-arm model does not include. C consists of Christoffel
-    symbols, so that :math:`C(q, a)\,b = \tfrac12\,(c(a+b) - c(a) - c(b))` with :math:`c(v) = C(q, v)\,v`.
+    Here, :math:`\gamma = a/(1 + b|\varepsilon|^2)` is the forgetting factor. The closure h of the person's hand is 0 if
+    the hand is open and 1 if it is closed. It raises the largest stiffness: :math:`K_{max}(h) = K_{lo} + h(K_{hi} -
+    K_{lo})`. The symbols :math:`\kappa, \Gamma, Q_F, Q_K, Q_D, a, b, K_{lo}, K_{hi}` are constant gains, and
+    :math:`D_{max} = 1.4 \sqrt{K_{max}(h)}`. The inertia matrix M, the Coriolis matrix C and the gravity torque G come
+    from the rigid links of ``ArmModel``. The adapted values F, K and D compensate for rotor inertia and friction. C is
+    computed from Christoffel symbols, so that :math:`C(q, a)\,b = \tfrac12\,(c(a+b) - c(a) - c(b))` with :math:`c(v) =
+    C(q, v)\,v`.
 
     The control law is a discrete form of the laws of Yang et al. (IEEE Trans. Robotics 2011) and Li and Burdet. The
-    values of the gains are our choice. For small errors, :math:`\gamma = a` and :math:`Q_K \gamma = 1`, so the
-    stiffness returns to :math:`K_{min}` within one period. The papers do not specify :math:`K_{min}`. We set
-    :math:`K_{min} = K_{max}(h)/2`, so that the closure of the hand has an effect even for small errors.
+    values of the gains are our choice. For small errors, :math:`\gamma` is a, and the product of a and :math:`Q_K` is
+    1. The stiffness then returns to :math:`K_{min}` within one period. The papers do not specify :math:`K_{min}`. We
+    set :math:`K_{min} = K_{max}(h)/2`, so that the closure of the hand has an effect even then.
 
     Args:
-        arm: arm model that provides M, C, G and the rated torques.
+        arm: arm model with M, C, G and the rated torques.
         period: control period T [s].
 
     Raises:
-        InputError: when the arm does not have seven joints; the gains are defined for seven joints only.
+        InputError: when the arm does not have seven joints, for which the gains are defined.
     """
 
     def __init__(self, arm: ArmModel, period: float) -> None:
@@ -174,7 +176,7 @@ class AdaptiveLaw:
         Args:
             q: joint positions, shape (n_joints,) [rad].
             velocity: joint velocities, shape (n_joints,) [rad/s].
-            reference: desired joint positions, shape (n_joints,) [rad].
+            reference: desired joint positions :math:`q_r`, shape (n_joints,) [rad].
             closure: closure of the person's hand, from 0 (open) to 1 (closed).
         """
         q, velocity, wanted = (np.asarray(x, dtype=float) for x in (q, velocity, reference))
@@ -222,22 +224,22 @@ class AdaptiveLaw:
 class AdaptiveControl(BaselineRetargeter):
     r"""Baseline M2: our interpretation of "discrete-time adaptive control" in the thesis.
 
-    The thesis refers to Liang et al. 2016, but we had access only to the abstract of this paper. The abstract describes
-    an arm configuration computed from Kinect vectors, a stiffness index computed from the hand's gesture, and a
-    biomimetic controller in discrete time on a simulated Baxter. We therefore use a discrete form of the human-like
-    controllers of Yang et al. 2011 and Li and Burdet 2016.
+    The thesis refers to Liang et al. 2016. We know only the abstract of this paper. It describes a controller of a
+    simulated Baxter arm in discrete time, with arm angles computed from Kinect data and a stiffness that depends on the
+    hand's gesture. We use a discrete form of the controllers of Yang et al. 2011 and Li and Burdet 2016, which resemble
+    human motor control.
 
-    The person's joint angles :math:`q_h` are constant between frames. A first-order low-pass filter with cut-off
-    frequency f = 3 Hz turns them into the reference, :math:`q_r \leftarrow q_r + (1 - e^{-2\pi f T})(q_h - q_r)`. An
-    :class:`AdaptiveLaw` computes torques within the rated limits, and these torques drive the simulated arm
-    (:class:`JointPlant`). The joint positions that the simulated arm reaches are the command to the robot. The method
-    tracks joint angles, so the tool and the hand are at different positions.
+    The joint angles of the person are mapped to joint positions :math:`q_h` of the robot, once per frame. A first-order
+    low-pass filter with the cut-off frequency f = 3 Hz computes the reference from :math:`q_h`: :math:`q_r \leftarrow
+    q_r + (1 - e^{-2\pi f T})(q_h - q_r)`. An :class:`AdaptiveLaw` computes torques within the rated limits, and these
+    torques drive the simulated arm (:class:`JointPlant`). The joint positions of the simulated arm are the command to
+    the robot. The method tracks joint angles, so the tool does not have the position of the hand.
 
-    Unless ``velocity_scaling`` is True, only the torque limits restrict the joint velocity. The dictionary ``notes``
-    has three entries.
+    If ``velocity_scaling`` is False, only the torque limits restrict the joint velocity. The dictionary ``notes`` has
+    three additional entries:
 
-    * ``"saturated"``: number of times that a joint reached its rated torque, over all joints and control steps;
-    * ``"peak_torque"``: largest torque before limiting, as a multiple of the rated torque;
+    * ``"saturated"``: number of torques above the rated torque, counted over all joints and control steps;
+    * ``"peak_torque"``: largest torque before it is limited, as a multiple of the joint's rated torque;
     * ``"rms_torque"``: root mean square torque over all joints and control steps [N m].
 
     Args:
@@ -245,14 +247,14 @@ class AdaptiveControl(BaselineRetargeter):
         correspondence: how the person's motion maps to the robot: side, sensor pose, scale and orientation.
         dt: control period T [s].
         scene: ignored.
-        velocity_scaling: whether to scale every step of the reference and of the command so that no joint exceeds its
-            velocity limit.
-        relative: whether to map the change of the person's joint angles since the robot began to follow the person;
-            otherwise the angles themselves are mapped, and the robot approaches the result at limited speed. See
-            :class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`.
+        velocity_scaling: whether to scale down all joints together in every step of the reference and of the command,
+            so that no joint exceeds its velocity limit.
+        relative: True: changes of the person's joint angles since the robot began to follow are added to the robot's
+            joint positions. False: the angles themselves are mapped, and the robot first moves to the result at limited
+            speed. See :class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`.
 
     Attributes:
-        torque: torque of the last control period, shape (n_joints,) [N m].
+        torque: torques applied in the last control period, shape (n_joints,) [N m].
 
     Raises:
         InputError: when the arm does not have the joint axes of a person's arm.
@@ -328,7 +330,7 @@ class AdaptiveControl(BaselineRetargeter):
 
     @property
     def notes(self) -> dict[str, float]:
-        """Counts and RMS torque since :meth:`start`; this class and its base class describe them."""
+        """Counts and torques since :meth:`start`; see the docstrings of this class and of its base class."""
         rms = math.sqrt(self._squares / self._periods) if self._periods else 0.0
         return {
             **super().notes,

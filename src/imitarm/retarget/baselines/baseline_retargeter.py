@@ -1,4 +1,4 @@
-"""BaselineRetargeter: the common part of the baselines M1 to M3, so that they differ only in the mapping itself."""
+"""BaselineRetargeter: base class of the baselines M1 to M3, which differ only in the mapping from person to robot."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ _ROUNDING = 1.0 + 1e-9
 
 
 class BaselineRetargeter(Retargeter):
-    """A baseline method; it processes its input in the same way as all other methods.
+    """Base class of the baselines, with the same processing of the input as all other methods.
 
-    The estimate of the person's arm, the engagement, the clutch and the scale are those of
-    :class:`~imitarm.retarget.retargeter.Retargeter`. The published methods leave two points open, which this class
-    decides in the same way for all baselines. The robot holds its position while the person is lost, and no joint
-    leaves its range. A method that does not limit velocities itself may exceed the velocity limits; ``notes`` counts
-    how often.
+    :class:`~imitarm.retarget.retargeter.Retargeter` estimates the person's arm, and decides when the robot follows the
+    person. The publications of the baselines do not describe two points, which this class decides. While the camera
+    does not see the person, the robot holds its position. Joint positions are clipped to the ranges of the joints. A
+    baseline may exceed velocity limits; ``notes`` counts how often.
 
-    A baseline implements ``_wanted``.
+    A subclass implements ``_wanted``.
 
     Args:
         arm: the robot's arm with its tool.
         correspondence: how the person's motion maps to the robot: side, sensor pose, scale and orientation.
         dt: control period [s].
         scene: ignored.
-        velocity_scaling: whether to scale every step as a whole so that no joint exceeds its velocity limit.
+        velocity_scaling: whether to scale down all joints together in every step, so that no joint exceeds its velocity
+            limit.
 
     Attributes:
-        counts: counts since :meth:`start`, by the names that ``notes`` lists.
+        counts: counts since :meth:`start`, by their names; see :attr:`notes`.
     """
 
     def __init__(
@@ -73,9 +73,9 @@ class BaselineRetargeter(Retargeter):
     def notes(self) -> dict[str, float]:
         """Counts since :meth:`start`, by name.
 
-        ``"velocity_excess"`` counts joint steps faster than the joint's velocity limit, before any scaling.
-        ``"position_clips"`` counts joint steps that were clipped at a position limit. A joint step is the motion of one
-        joint in one control period.
+        A *joint step* is the motion of one joint in one control period. ``"velocity_excess"`` is the number of joint
+        steps that were faster than the velocity limit, before any scaling. ``"position_clips"`` is the number of joint
+        steps that were clipped at a position limit.
         """
         return {name: float(self.counts[name]) for name in ("velocity_excess", "position_clips", *self.counts)}
 

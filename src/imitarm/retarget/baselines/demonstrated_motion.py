@@ -1,4 +1,4 @@
-"""DemonstratedMotion: the motion of a person's arm and of the robot's joints, and where it is infeasible."""
+"""DemonstratedMotion: the motion of a person's arm and of the robot, and a check for infeasible parts."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ _WITHIN = 1e-6  # [rad] tolerance of a position limit
 
 @dataclass(frozen=True, eq=False)
 class DemonstratedMotion:
-    """The motion during one engagement (while the robot follows the person), sampled at the control period.
+    """The motion during one engagement (a time in which the robot follows the person), sampled at the control period.
 
     Attributes:
-        shown_times: for each sample, the time at which the person made this motion, on the recording's clock, shape
-            (n,) [s]. The times are evenly spaced as long as no correction has slowed the motion down.
-        points: shoulder, elbow and wrist in the base frame, after all corrections made so far, shape (n, 3, 3) [m].
+        shown_times: time at which the person showed each sample, on the clock of the recording, shape (n,) [s]. After a
+            correction that slows the motion down, the times are closer together than the control period.
+        points: shoulder, elbow and wrist in the base frame, with all corrections so far, shape (n, 3, 3) [m].
         hands: rotations of the hand, quaternions wxyz, shape (n, 4).
-        shown: shoulder, elbow and wrist as the person showed them, before all corrections, shape (n, 3, 3) [m].
-        closed: for each sample, whether the hand was closed; None where this is unknown.
-        joints: joint positions of the robot, shape (n, n_joints) [rad]; shape (n, 0) before the mapping.
+        shown: shoulder, elbow and wrist in the base frame, without corrections, shape (n, 3, 3) [m].
+        closed: whether the hand was closed at each sample; None if this is not known.
+        joints: joint positions of the robot, shape (n, n_joints) [rad]; shape (n, 0) before they are computed.
     """
 
     shown_times: Array
@@ -51,7 +51,7 @@ class DemonstratedMotion:
 
     @classmethod
     def through(cls, estimates: Sequence[ArmEstimate], dt: float) -> DemonstratedMotion:
-        """Interpolate the two or more estimates of one engagement without overshoot, with a step of ``dt`` [s]."""
+        """Interpolate the estimates of one engagement (at least two) at intervals of ``dt`` [s], without overshoot."""
         times = np.array([e.time for e in estimates])
         shown_times = times[0] + dt * np.arange(int((times[-1] - times[0]) / dt + 1e-9) + 1)
         keys = np.array([(e.shoulder, e.elbow, e.wrist) for e in estimates])
@@ -65,7 +65,7 @@ class DemonstratedMotion:
         return len(self.shown_times)
 
     def estimate(self, i: int) -> ArmEstimate:
-        """Return sample ``i`` as an estimate of the person's arm, which is the input of live methods."""
+        """Return sample ``i`` as an estimate of the person's arm."""
         s, e, w = self.points[i]
         rest = np.zeros(3)
         return ArmEstimate(
@@ -77,9 +77,9 @@ class DemonstratedMotion:
         return map(self.estimate, range(len(self)))
 
     def at(self, where: Array) -> DemonstratedMotion:
-        """Return the motion interpolated at fractional sample numbers, shape (m,).
+        """Return the motion, interpolated at the sample numbers ``where``, which need not be whole, shape (m,).
 
-        The closer together the sample numbers are, the slower the motion becomes.
+        For example, the sample numbers 0, 0.5, 1, ... give the motion at half the speed.
         """
         n = np.arange(len(self))
         near = tuple(self.closed[int(i)] for i in np.clip(where.astype(int), 0, len(self) - 1))
@@ -101,9 +101,9 @@ class DemonstratedMotion:
 def engagements(
     frames: Iterable[Skeleton], correspondence: Correspondence, rule: EngagementRule
 ) -> Iterator[tuple[ArmEstimate, ...]]:
-    """For each engagement in a recording, yield the estimates of the person's arm.
+    """Yield the estimates of the person's arm in each engagement of a recording.
 
-    Engagements with fewer than two estimates are left out.
+    An engagement is a time in which the robot follows the person. Engagements with only one estimate are left out.
 
     Args:
         frames: frames in order of time.
@@ -133,10 +133,10 @@ def engagements(
 
 
 class Constraint(Protocol):
-    """A condition on the pose of the tool, as a teacher would annotate it."""
+    """A condition on the pose of the tool, for example from a teacher."""
 
     def __call__(self, positions: Array, rotations: Array, /) -> Mask:
-        """Return whether the condition holds, shape (n,), for positions (n, 3) [m] and rotations (n, 3, 3)."""
+        """Return whether the condition holds for each of n tool poses; positions (n, 3) [m], rotations (n, 3, 3)."""
         ...
 
 
@@ -150,7 +150,7 @@ def above(height: float) -> Constraint:
 
 
 def upright(angle: float) -> Constraint:
-    """Return the constraint that the tool points straight down, with a tolerance of ``angle`` [rad]."""
+    """Return the constraint that the z axis of the tool points down, with a tolerance of ``angle`` [rad]."""
 
     def holds(_: Array, rotations: Array) -> Mask:
         return np.asarray(-rotations[:, 2, 2] > np.cos(angle))
@@ -161,13 +161,14 @@ def upright(angle: float) -> Constraint:
 class FeasibilityCheck:
     """Finds the infeasible samples of a joint motion (baseline M1).
 
-    A sample is infeasible if a joint exceeds a position or velocity limit, if the arm is singular (smallest singular
-    value :math:`s_{min} < 0.03`) or stretched (:func:`stretch` above 79/80), or if a constraint does not hold.
+    A sample is infeasible if one of these conditions holds. A joint exceeds a position or velocity limit. The smallest
+    singular value of the tool's Jacobian is below 0.03. The arm is almost straight (:func:`stretch` above 79/80). An
+    additional constraint is violated.
 
     Args:
         arm: the robot's arm with its tool.
         dt: sampling period [s].
-        constraints: additional constraints, by name.
+        constraints: additional constraints by their names; None: no constraints.
 
     Raises:
         InputError: when a constraint has the name of a built-in condition.
@@ -187,15 +188,15 @@ class FeasibilityCheck:
             )
 
     def reasons(self, joints: Array) -> dict[str, Mask]:
-        """For each condition, return a mask (n,) of the samples in ``joints`` (n, n_joints) [rad] that violate it."""
+        """Return, for each condition, which samples of ``joints`` (n, n_joints) [rad] violate it, shape (n,)."""
         return {"speed": self.too_fast(joints), **self.postures(joints)}
 
     def anywhere(self, joints: Array) -> Mask:
-        """Return a mask (n,) of the samples in ``joints`` (n, n_joints) [rad] that violate any condition."""
+        """Return whether each sample of ``joints`` (n, n_joints) [rad] is infeasible for any reason, shape (n,)."""
         return np.asarray(np.any(list(self.reasons(joints).values()), axis=0))
 
     def too_fast(self, joints: Array) -> Mask:
-        """Return the samples before and after each step that exceeds a velocity limit, shape (n,) bool."""
+        """Return whether a joint is too fast just before or after each sample, shape (n,)."""
         found = np.zeros(len(joints), dtype=bool)
         over = (self.speeds(joints) > 1.0 + 1e-9).any(axis=1)
         found[1:] |= over
@@ -207,7 +208,7 @@ class FeasibilityCheck:
         return np.asarray(np.abs(np.diff(joints, axis=0)) / (self.dt * self.arm.max_velocity))
 
     def postures(self, joints: Array) -> dict[str, Mask]:
-        """For each condition on a single posture, return a mask (n,) of the samples that violate it."""
+        """Return, for each condition except the speed, which samples violate it, shape (n,)."""
         jacobians = np.array([self.arm.tool_jacobian(q) for q in joints]).reshape(-1, 6, self.arm.n_joints)
         found: dict[str, Mask] = {
             "limits": self.outside(joints),
@@ -221,39 +222,41 @@ class FeasibilityCheck:
         return found
 
     def clear(self, joints: Array) -> bool:
-        """Return whether the motion is feasible everywhere; cheap conditions are checked first."""
+        """Return whether the whole motion is feasible."""
         return not (self.too_fast(joints).any() or self.outside(joints).any() or self._in_postures(joints))
 
     def allows(self, q: Array) -> bool:
-        """Return whether a posture (n_joints,) [rad] is feasible."""
+        """Return whether a posture (n_joints,) [rad] is feasible at rest."""
         return not (self.outside(q[None])[0] or self._in_postures(q[None]))
 
     def _in_postures(self, joints: Array) -> bool:
         return any(found.any() for found in self.postures(joints).values())
 
     def outside(self, joints: Array) -> Mask:
-        """Return the samples at which a joint is outside its range, shape (n,) bool."""
+        """Return whether a joint is outside its range at each sample, shape (n,)."""
         beyond = (joints < self.arm.lower - _WITHIN) | (joints > self.arm.upper + _WITHIN)
         return np.asarray(beyond.any(axis=1))
 
 
 def stretch(joints: Array) -> Array:
-    r"""Return how far a person's arm would be stretched if it had the joint angles of the robot, shape (n,).
+    r"""Return how straight the robot's arm is, from 0 to 1 (straight), shape (n,).
 
-    The argument is the robot's joint positions, shape (n, n_joints) [rad]. The stretch is the distance from shoulder to
-    wrist, divided by the length of the straight arm. For a person's arm with upper arm and forearm of equal length, the
-    stretch is :math:`|\cos(q_3/2)|`. Sawyer's upper arm and forearm have almost equal lengths (0.412 and 0.411 m). The
-    distance from the robot's own shoulder to its wrist is not used, because the offsets between the links make this
-    distance largest when the elbow is bent.
+    The argument ``joints`` contains the robot's joint positions, shape (n, n_joints) [rad]. The result is
+    :math:`|\cos(q_3/2)|`, where :math:`q_3` is the angle of the elbow. For a human arm with upper arm and forearm of
+    equal length, this is the distance from shoulder to wrist, divided by the length of the straight arm. The robot's
+    own distance from shoulder to wrist is not used. Its links have offsets, so this distance is largest when the elbow
+    is bent.
     """
     return np.asarray(np.abs(np.cos(0.5 * joints[:, ELBOW])))
 
 
 def segments(found: Mask, dt: float) -> list[tuple[int, int]]:
-    """Return the segments in which the mask is True, as (first, end), extended by 0.2 s on both sides and merged.
+    """Return segments (first sample, sample after the last) that contain all samples in ``found``.
+
+    Each segment begins 0.2 s before its first sample in ``found``, and ends 0.2 s after its last one.
 
     Args:
-        found: mask of the samples to group into segments, shape (n,) bool.
+        found: True for each sample that must be in a segment, shape (n,).
         dt: sampling period [s].
     """
     wide = round(DILATION / dt)
@@ -265,7 +268,7 @@ def segments(found: Mask, dt: float) -> list[tuple[int, int]]:
 def blend(found: Mask, first: int, past: int, dt: float) -> Array:
     """Return the weight of a correction for each sample of a segment, shape (past - first,).
 
-    The weight is 1 at the samples that need the correction, and falls to 0 within 0.2 s before and after them.
+    The weight is 1 at the samples in ``found``, and falls to 0 within 0.2 s before and after these samples.
     """
     at = np.arange(first, past)
     needed = at[found[first:past]]

@@ -1,9 +1,9 @@
-"""DemonstrationModification: baseline M1, which maps a person's joint angles and corrects infeasible segments.
+"""DemonstrationModification: baseline M1, which maps joint angles and corrects segments that the robot can't execute.
 
-Four corrections replace the teacher's advice: slow the motion down, move the wrist closer, rotate the elbow, or repair
-key frames. Each correction changes one segment of a
-:class:`~imitarm.retarget.baselines.demonstrated_motion.DemonstratedMotion`. The correction has full weight where it is
-needed, and its weight falls to 0 at the ends of the segment, so that the motion stays continuous.
+There are four corrections: slow the motion down, move the wrist closer to the shoulder, rotate the elbow, or repair key
+frames. Each correction changes one segment of a
+:class:`~imitarm.retarget.baselines.demonstrated_motion.DemonstratedMotion`. Its weight is 1 at the infeasible samples
+and falls to 0 at the ends of the segment, so that the motion stays continuous.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ COUNTED = (
     "shown_time",
     "corrected_time",
 )
-"""Names of the counts that are summed over all engagements of a recording."""
+"""Names of the counts, which are summed over all engagements of a recording."""
 
 _STRIDE = 10  # every tenth sample is checked first
 _SLOWEST = 10.0  # largest factor of slowing down
@@ -71,19 +71,20 @@ _SLOWEST = 10.0  # largest factor of slowing down
 class DemonstrationModification(BaselineRetargeter):
     """Baseline M1: our interpretation of "demonstration modification" in the thesis.
 
-    The method combines two published ideas. In Argall's work, a teacher selects an "advice operator", which corrects
-    one segment of an executed motion. Mueller et al. 2018 annotate constraints and replace key frames that violate
-    them. Argall's paper is about policies of a mobile robot. We therefore designed corrections for the motion of an
-    arm. A program, not a teacher, selects these corrections.
+    The method combines two published ideas. In the work of Argall, a teacher selects an "advice operator", which
+    corrects one segment of an executed motion. In the work of Mueller et al. 2018, a teacher annotates constraints, and
+    key frames that violate a constraint are replaced. Argall's operators are for a mobile robot, so we designed
+    corrections for an arm. Here, a program selects the correction instead of a teacher.
 
     The method is offline. :meth:`run` processes the whole recording in four steps:
 
-    1. the person's joint angles are computed in closed form and mapped to the robot's joints
+    1. the person's joint angles are computed and mapped to the robot's joints
        (:class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`);
-    2. :class:`~imitarm.retarget.baselines.demonstrated_motion.FeasibilityCheck` finds the infeasible segments;
-    3. each infeasible segment, extended by 0.2 s on both sides, is changed by the first correction that makes it
-       feasible (slower, wrist closer, or elbow rotated); if no correction makes it feasible, the key frames of the
-       segment are repaired (:class:`SegmentCorrector`);
+    2. :class:`~imitarm.retarget.baselines.demonstrated_motion.FeasibilityCheck` finds the samples that the robot can't
+       execute (infeasible samples) and groups them into segments;
+    3. each segment is slowed down, its wrist is moved closer, or its elbow is rotated: the first correction that makes
+       the segment feasible is used; if none does, the key frames of the segment are repaired
+       (:class:`SegmentCorrector`);
     4. steps 2 and 3 are repeated up to five times; samples that remain infeasible are counted and clipped to the
        joint ranges.
 
@@ -93,27 +94,28 @@ class DemonstrationModification(BaselineRetargeter):
 
     * ``"rounds"``: number of rounds of corrections;
     * ``"segments"``: number of corrected segments in all rounds; ``"slowed"``, ``"pulled_in"``, ``"elbow_rotated"`` and
-      ``"repaired"`` count the segments that each correction has corrected;
+      ``"repaired"``: number of segments changed by each correction;
     * ``"missed_keys"``: number of key frames for which no feasible posture was found;
     * ``"infeasible_before"`` and ``"infeasible_after"``: number of infeasible samples before and after the corrections;
     * ``"failures"``: number of segments that remain infeasible;
     * ``"execution_time"``: duration of the robot's motion [s]; ``"shown_time"``: duration of the person's motion [s];
-    * ``"teaching_time"``: assumed working time of a teacher [s]: the duration of each segment plus ``annotation_time``,
-      summed over all segments of all rounds.
+    * ``"teaching_time"``: assumed working time of a teacher [s]: the sum, over all corrected segments, of the duration
+      of the segment and ``annotation_time``.
 
     Args:
         arm: the robot's arm with its tool.
         correspondence: how the person's motion maps to the robot: side, sensor pose, scale and orientation.
         dt: control period [s].
         scene: ignored.
-        velocity_scaling: whether to scale every step as a whole so that no joint exceeds its velocity limit.
-        relative: whether to map the change of the person's joint angles since the robot began to follow the person;
-            otherwise the angles themselves are mapped, and the robot approaches the result at limited speed. See
-            :class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`.
-        constraints: additional conditions that the tool must satisfy, by name, for example ``{"table": above(0.02)}``.
-        annotation_time: assumed time that a teacher needs to annotate a segment, in addition to the time for watching
-            it [s].
-        seed: seed of the random postures that are tried when key frames are repaired.
+        velocity_scaling: whether to scale down all joints together in every step, so that no joint exceeds its velocity
+            limit.
+        relative: True: changes of the person's joint angles since the robot began to follow are added to the robot's
+            joint positions. False: the angles themselves are mapped, and the robot first moves to the result at limited
+            speed. See :class:`~imitarm.retarget.baselines.joint_mapping.JointMapping`.
+        constraints: additional conditions for the tool by their names, for example ``{"table": above(0.02)}``; None: no
+            additional conditions.
+        annotation_time: assumed time that a teacher needs to annotate a segment after watching it [s].
+        seed: seed of the random postures that are tried in the repair of key frames.
 
     Attributes:
         check: feasibility check that finds the infeasible samples.
@@ -170,9 +172,9 @@ class DemonstrationModification(BaselineRetargeter):
     def run(self, skeletons: Iterable[Skeleton], q: ArrayLike | None = None) -> Retargeting:
         """Retarget a whole recording and correct the motion; ``notes`` counts the changes.
 
-        If the motion is slowed down, the result is longer than the recording; ``shown_times`` contains the time at
-        which the person showed each sample. Slowing the motion down also slows its targets down; the other corrections
-        do not change the targets.
+        If the motion is slowed down, the result is longer than the recording. Its ``shown_times`` contain the time at
+        which the person showed each sample. The targets of the tool are then slowed down, too. The other corrections do
+        not change the targets.
 
         Args:
             skeletons: skeletons in order of time.
@@ -262,17 +264,17 @@ class DemonstrationModification(BaselineRetargeter):
 def slowed(
     motion: DemonstratedMotion, first: int, past: int, weight: Array, factor: float
 ) -> tuple[DemonstratedMotion, int]:
-    r"""Slow down a segment of a motion: each sample takes :math:`1 + w\,(s - 1)` times as long.
+    r"""Slow down a segment of a motion: the time for each sample becomes :math:`1 + w\,(s - 1)` times as long.
 
     Args:
-        motion: motion whose joints have been mapped to the robot.
+        motion: motion with joint positions of the robot.
         first: first sample of the segment.
         past: index of the sample after the segment.
         weight: weight w of each sample, shape (past - first,).
-        factor: s, at least 1.
+        factor: factor s of the time, at least 1.
 
     Returns:
-        The motion, and the index of the sample at which the segment now ends.
+        The slower motion, and the new index of the sample after the segment.
     """
     stretch = np.ones(len(motion))
     stretch[first:past] += weight * (factor - 1.0)
@@ -283,12 +285,13 @@ def slowed(
 
 
 def pull(points: Array, joints: Array) -> Array:
-    r"""Return the factor :math:`\kappa` by which to shorten the distance from shoulder to wrist, shape (n,).
+    r"""Return the factor :math:`\kappa` by which the person's wrist must move closer to the shoulder, shape (n,).
 
-    With this factor, the robot's arm is stretched to at most 78/80 of its reach. If the elbow angles of robot and
-    person are equal, :math:`\kappa = \frac{78}{80} L / |W - S|`, where L is the length of the straight arm. In a
-    relative mapping, the elbow angles of robot and person can differ. The function then computes how much further the
-    robot's elbow must bend until the arm is stretched to 78/80, and bends the person's elbow by the same angle.
+    The function computes by how much the robot's elbow must bend further, until
+    :func:`~imitarm.retarget.baselines.demonstrated_motion.stretch` is at most 78/80. The factor is such that the
+    person's elbow bends by the same angle. In a relative mapping, the elbow angles of robot and person can differ. If
+    they are equal, :math:`\kappa = \frac{78}{80} L / |W - S|`, where W is the wrist, S the shoulder and L the length of
+    the straight arm.
 
     Args:
         points: shoulder, elbow, wrist, shape (n, 3, 3) [m].
@@ -304,7 +307,7 @@ def pull(points: Array, joints: Array) -> Array:
 
 
 def pulled_in(points: Array, kappa: Array) -> Array:
-    r"""Move the wrist towards the shoulder, :math:`W' = S + \kappa (W - S)`; the elbow stays in the plane of the arm.
+    r"""Move the wrist to :math:`W' = S + \kappa (W - S)`, where S is the shoulder and W the wrist.
 
     Args:
         points: shoulder, elbow, wrist, shape (n, 3, 3) [m].
@@ -347,7 +350,7 @@ def elbow_rotated(points: Array, angle: Array) -> Array:
 
 
 def with_points(motion: DemonstratedMotion, first: int, past: int, points: Array) -> DemonstratedMotion:
-    """Return the motion with new points (past - first, 3, 3) [m] in a segment; the joints must then be mapped again."""
+    """Return the motion with new points (past - first, 3, 3) [m] in a segment, and with its old joint positions."""
     changed = motion.points.copy()
     changed[first:past] = points
     return replace(motion, points=changed)
@@ -358,17 +361,18 @@ def repaired(
 ) -> tuple[Array, int]:
     r"""Repair the key frames of a segment (after Mueller et al. 2018), and interpolate between them by a cubic spline.
 
-    A segment has five key frames. A key frame that is already feasible is kept. For each infeasible key frame, a normal
-    distribution :math:`N(\mu_k, \Sigma_k)` is fitted to the joint positions around it, and up to 500 random postures
-    are drawn from this distribution until one is feasible. If none of the postures is feasible, the key frame becomes
-    :math:`\mu_k`, clipped to the joint ranges.
+    A segment has five key frames. Feasible key frames are kept. For an infeasible key frame with the joint positions
+    :math:`\mu_k`, random postures are drawn from the normal distribution :math:`N(\mu_k, \Sigma_k)`, until one is
+    feasible. The covariance :math:`\Sigma_k` is that of the joint positions up to 0.2 s before and after the key frame,
+    plus :math:`(0.1\,\mathrm{rad})^2 I`. If 500 postures are infeasible, the key frame becomes :math:`\mu_k`, clipped
+    to the joint ranges.
 
     Args:
         joints: joint positions of the whole motion, shape (n, n_joints) [rad].
         first: first sample of the segment.
         past: index of the sample after the segment.
-        check: feasibility check that decides whether a posture is feasible.
-        rng: random generator for the postures that are drawn.
+        check: check whether a posture is feasible.
+        rng: random number generator for the postures.
 
     Returns:
         Joint positions, shape (n, n_joints) [rad], unchanged outside the segment; and the number of key frames for
@@ -417,13 +421,13 @@ def _length(vectors: Array) -> Array:
 
 
 class SegmentCorrector:
-    """Corrects the motion of one engagement in rounds (baseline M1).
+    """Corrects the motion of one engagement in several rounds (baseline M1).
 
     Args:
-        mapping: mapping from the person's joints to the robot's joints, started at the robot's current posture.
-        clutch: clutch of this engagement.
+        mapping: mapping from the person's joint angles to the robot's joints, started at the robot's current posture.
+        clutch: the poses of hand and tool when the robot began to follow the person.
         check: feasibility check that finds the infeasible samples.
-        rng: random generator for the postures that a repair draws.
+        rng: random number generator for the repair of key frames.
 
     Attributes:
         rounds: number of rounds of corrections so far.
@@ -441,7 +445,7 @@ class SegmentCorrector:
         """Map the motion to the robot's joints, correct it as far as possible, and return it.
 
         Args:
-            motion: motion of the person, not yet mapped to joints of the robot.
+            motion: motion of the person, without joint positions of the robot.
             rounds: largest number of rounds of corrections.
         """
         dt = self._check.dt

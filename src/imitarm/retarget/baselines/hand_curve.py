@@ -1,4 +1,4 @@
-"""HandCurve: a smooth curve of a hand's pose, fitted during capture and evaluated with a fixed delay."""
+"""HandCurve: a smooth curve of a hand's pose over time, which can be fitted during the motion."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ _RESTART = 0.25  # [s] a source whose clock jumps by more has restarted
 class RotationCurve:
     r"""A smooth curve of rotations, :math:`R(t) = R_0 \exp(c(t))`, where c is a :class:`NURBS` of rotation vectors.
 
-    Roll, pitch and yaw wrap around and have singularities. Rotation vectors relative to a mean rotation neither wrap
-    around nor have singularities for angles below 360 degrees.
+    Rotation vectors relative to a mean rotation are continuous and have no singularity for angles below 360 degrees.
+    Roll, pitch and yaw do not have these properties.
 
     Attributes:
         reference: reference rotation :math:`R_0`, quaternion wxyz, shape (4,).
@@ -60,16 +60,16 @@ def fit_rotations(
     sigma: float | None = None,
     robust: bool = True,
 ) -> RotationCurve:
-    """Fit a curve to rotations; :func:`fit_nurbs` fits their rotation vectors relative to the mean rotation.
+    """Fit a curve to rotations: to their rotation vectors relative to their mean rotation (:func:`fit_nurbs`).
 
     Args:
         times: times of the samples, strictly increasing, shape (k,) [s].
-        quaternions: unit quaternions wxyz, shape (k, 4); signs do not matter.
+        quaternions: unit quaternions wxyz, shape (k, 4); q and -q are the same rotation.
         confidence: confidences from 0 to 1, shape (k,); None: all 1.
-        degree: degree of the curve, as in :func:`fit_nurbs`.
-        n_control: number of control points.
-        smoothing: a number, ``"gcv"`` or ``"morozov"``, as in :func:`fit_nurbs`.
-        sigma: standard deviation of the measured rotation vectors on each axis [rad].
+        degree: degree of the curve.
+        n_control: number of control points; None: see :func:`fit_nurbs`.
+        smoothing: weight of the smoothing, ``"gcv"`` or ``"morozov"``, see :func:`fit_nurbs`.
+        sigma: standard deviation of the measured rotation vectors on each axis [rad]; None: it is estimated.
         robust: whether to reduce the weight of outliers.
 
     Raises:
@@ -111,10 +111,10 @@ class HandSample:
     """Pose of a hand in one frame.
 
     Attributes:
-        time: time on the source's clock [s].
+        time: time of the frame, on the clock of the camera or recording [s].
         wrist: wrist position in the base frame, shape (3,) [m].
         hand: hand rotation in the base frame, quaternion wxyz, shape (4,).
-        confidence: confidence of the position and of the rotation, 0 to 1.
+        confidence: confidences of the position and of the rotation, each 0 to 1.
     """
 
     time: float
@@ -125,11 +125,11 @@ class HandSample:
 
 @dataclass(frozen=True, eq=False)
 class HandCurve:
-    """A smooth motion of a hand.
+    """A smooth curve of a hand's position and rotation.
 
     Attributes:
-        wrist: wrist position [m] over time [s].
-        hand: hand rotation over time.
+        wrist: curve of the wrist position [m] over time [s].
+        hand: curve of the hand rotation over time [s].
     """
 
     wrist: NURBS
@@ -166,24 +166,24 @@ class HandCurve:
         return cls(wrist, hand)
 
     def at(self, time: float) -> tuple[Array, Array]:
-        """Return wrist (3,) [m] and hand quaternion (4,) at a time; beyond the ends of the curve, both are constant."""
+        """Return wrist (3,) [m] and hand quaternion (4,) at a time [s]; both are constant beyond the curve."""
         return self.wrist.evaluate(time), self.hand.evaluate(time)
 
 
 class DelayedCurve:
-    """Smooths a hand's motion during capture.
+    """Smooths a hand's motion while it is captured.
 
     The filter fits a curve to the last 0.6 s (``window``) and evaluates this curve ``lag`` seconds in the past.
 
-    The lag is needed because the end of a fitted curve changes with every new frame, whereas a slightly earlier point
-    is supported by frames before and after it. Frames arrive irregularly. The filter therefore advances its time in
-    control steps, and uses the frames' time stamps only to correct this time.
+    The end of a fitted curve changes with every new frame. A point that is ``lag`` seconds earlier changes less,
+    because there are frames before and after it. Frames arrive at irregular times. The filter therefore advances its
+    time with the control steps, and uses the time stamps of the frames only to correct this time.
 
     Args:
         window: length of the time window to which the curve is fitted [s].
-        lag: how far in the past the curve is evaluated [s].
-        smooth: whether to fit a curve; False returns the newest frame unchanged.
-        whole: curve of the complete motion, to be evaluated without lag; None: a curve is fitted live.
+        lag: time between the evaluated point of the curve and the current time [s].
+        smooth: whether to fit a curve; if False, the result is the pose in the newest frame.
+        whole: curve of the complete motion, which is evaluated without lag; None: a curve is fitted to the last frames.
     """
 
     def __init__(
@@ -210,7 +210,7 @@ class DelayedCurve:
             self._curve = HandCurve.through(seen, _MU) if len(seen) > _DEGREE else None
 
     def step(self, dt: float) -> None:
-        """Advance the time by ``dt`` [s]."""
+        """Advance the time of the filter by ``dt`` [s]."""
         self._clock += dt
 
     def now(self) -> tuple[Array, Array] | None:

@@ -1,4 +1,4 @@
-"""IncrementalIK: baseline M3, resolved-rate control with error feedback and no treatment of singularities."""
+"""IncrementalIK: baseline M3, resolved-rate control with error feedback and an undamped pseudo-inverse."""
 
 from __future__ import annotations
 
@@ -23,35 +23,34 @@ _RCOND = 1e-6  # ignores only singular values that are numerically zero
 class IncrementalIK(BaselineRetargeter):
     r"""Baseline M3: our interpretation of "incremental inverse kinematics" in the thesis.
 
-    For this method, the thesis cites Ijspeert et al. 2002, a paper on movement primitives. The abstract of that paper
-    does not mention incremental inverse kinematics. M3 is therefore not a published method, but our interpretation of
-    the name. Once per frame, M3 computes the joint displacement
+    The thesis cites Ijspeert et al. 2002 for this method, but the abstract of this paper is about movement primitives.
+    M3 is therefore our interpretation of the name, not a published method. Once per frame of the camera, M3 computes
+    the joint displacement
 
     .. math:: \Delta q = J^+ \left(\Delta x_d + K\,e\right), \qquad e = \log(T_d\,T(q)^{-1}),
 
-    where :math:`J^+` is the pseudo-inverse of the tool's Jacobian, :math:`\Delta x_d` the displacement of the target
-    since the last frame, and e the error of the tool's pose T(q) relative to the target pose :math:`T_d` of the last
-    frame. The displacement is spread evenly over the control steps of one frame. The pseudo-inverse is not damped.
-    Without damping, even the smallest singular value is inverted, so the joint displacement grows without bound near
-    the edge of the workspace. Each joint is then limited to its velocity limit and to its range, which changes the
-    direction of the tool's motion. In ``notes``, ``"capped_steps"`` counts the control steps in which a velocity limit
-    was active, and ``"caps"`` counts the limited joints in all of these steps.
+    where :math:`J^+` is the pseudo-inverse of the tool's Jacobian, and :math:`\Delta x_d` is the displacement of the
+    target since the last frame. The error e is that of the tool's pose T(q) relative to the target pose :math:`T_d` of
+    the last frame. The displacement :math:`\Delta q` is distributed evenly over the control steps of one frame. The
+    pseudo-inverse is not damped, so :math:`\Delta q` grows without bound near singularities, for example at the edge of
+    the workspace. Each joint is then limited to its velocity limit and its range, which changes the direction of the
+    tool's motion. In ``notes``, ``"capped_steps"`` is the number of control steps in which a velocity limit was active.
+    ``"caps"`` is the number of limited joints, summed over these steps.
 
-    The movement primitives of the cited paper are left out. Movement primitives belong to the learned skill and can be
-    used with every method. If M3 included movement primitives, a comparison would evaluate the primitives instead of
-    the mappings.
+    M3 does not include the movement primitives of the cited paper, because this library uses movement primitives in the
+    learned skill, with every retargeting method.
 
     Args:
         arm: the robot's arm with its tool.
         correspondence: how the person's motion maps to the robot: side, sensor pose, scale and orientation.
         dt: control period [s].
         scene: ignored.
-        velocity_scaling: whether to scale every step as a whole so that no joint exceeds its limit, instead of limiting
-            each joint.
+        velocity_scaling: True: all joints are scaled down together in every step, so that no joint exceeds its velocity
+            limit. False: each joint is limited separately.
         gain: gain K, the fraction of the error that is corrected per frame.
 
     Raises:
-        InputError: when the gain is not in (0, 1].
+        InputError: when the gain is not above 0 and at most 1.
     """
 
     name: ClassVar[str] = "m3"

@@ -17,10 +17,10 @@ from imitarm.validation import flag
 Array = NDArray[np.float64]
 
 _STRETCHED = ((0.0,) * 7, (0.0, 0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, -0.5 * np.pi, 0.0, 0.0, 0.0, 0.0, 0.0))
-"""Postures to try; the mapping uses the first of them in which the robot's arm is stretched forward.
+"""Postures in which the arm of a robot may be stretched forward; the mapping uses the first one that fits.
 
-When all joint positions are zero, Sawyer's arm points forward. The Panda's arm points forward when its second joint is
-at a right angle.
+Sawyer's arm is stretched forward if all joint positions are zero. The Panda's arm is stretched forward if its second
+joint is at 90 degrees and all others are zero.
 """
 _ALIGNED = 0.999  # smallest cosine between a joint's axis and the person's
 _ANY = LimbLengths(0.3, 0.26)  # where only rotations matter
@@ -28,35 +28,34 @@ _AHEAD = np.array([1.0, 0.0, 0.0])
 
 
 class JointMapping:
-    r"""Maps the seven angles of a person's arm to seven robot joints with the same order of axes.
+    r"""Maps the seven joint angles of a person's arm to a robot arm whose seven joints have the same axes.
 
     When a person's arm is stretched forward, its joints rotate about z, y, x, y, x, y, x
-    (:mod:`imitarm.retarget.human_arm`). Sawyer's joints have the same axes as a person's arm when all joint positions
-    are zero. The Panda's joints have the axes of a person's arm, some in the opposite direction, when the Panda's
-    second joint is at a right angle. Let :math:`q^*` be the posture in which the robot's joints have the axes of a
-    person's arm, :math:`\sigma_i = \pm 1` the directions of its joints, and :math:`\theta_i` the person's angles. The
-    mapping is
+    (:mod:`imitarm.retarget.human_arm`). Let :math:`q^*` be the posture in which the robot's joints have the same axes.
+    For Sawyer, all joint positions are zero in this posture. For the Panda, the second joint is at 90 degrees, and some
+    axes point in the opposite direction. Let :math:`\sigma_i = \pm 1` be the direction of axis i, and :math:`\theta_i`
+    the person's angle. The mapping is
 
     .. math:: q_i = q^*_i + \sigma_i\,\theta_i \quad\text{(absolute)}, \qquad
               q_i = q_{i,0} + \sigma_i\,(\theta_i - \theta_{i,0}) \quad\text{(relative)},
 
     where :math:`q_{i,0}` and :math:`\theta_{i,0}` are the joint positions of robot and person when the robot began to
-    follow the person. The equations of both mappings determine only the first four joints (shoulder and elbow). The
-    last three joints are computed in closed form from the desired rotation of the tool. The tool's desired rotation is
-    the hand's rotation if the mapping is absolute and the orientation of the correspondence is ``"hand"``; otherwise,
-    it is the rotation of the clutch's target. Like every mapping of joints, this mapping does not use link lengths, so
-    the tool and the hand are at different positions.
+    follow the person. These equations determine the first four joints (shoulder and elbow). The last three joints are
+    computed from the desired rotation of the tool. In the absolute mapping with the orientation ``"hand"``, this is the
+    rotation of the person's hand. Otherwise, it is the rotation of :meth:`Clutch.target
+    <imitarm.retarget.correspondence.Clutch.target>`. The mapping does not use link lengths, so the tool does not have
+    the position of the hand.
 
-    The angles are continuous from frame to frame, without jumps by 360 degrees. An angle that is undefined keeps its
-    last value.
+    The angles do not jump by 360 degrees between frames. An angle that is undefined keeps its last value.
 
     Args:
         arm: the robot's arm.
-        relative: whether to use the relative mapping; otherwise, the absolute mapping is used.
+        relative: True: the relative mapping; False: the absolute mapping.
 
     Attributes:
         zero: the posture :math:`q^*`, in which the arm is stretched forward, shape (7,) [rad].
-        sense: the directions :math:`\sigma`: 1 if a joint rotates like the person's joint, -1 if opposite, shape (7,).
+        sense: the directions :math:`\sigma`, shape (7,): 1 if a joint rotates like the person's joint, -1 if it rotates
+            in the opposite direction.
 
     Raises:
         InputError: when the arm does not have the joint axes of a person's arm.
@@ -76,7 +75,7 @@ class JointMapping:
         self._origin: tuple[Array, Array] | None = None  # robot's joints and person's angles when engaged
 
     def resume(self, q: Array) -> None:
-        """Continue at joint positions ``q``, shape (7,) [rad], to map a part of a motion again.
+        """Continue at joint positions ``q``, shape (7,) [rad], in order to map a part of a motion again.
 
         A relative mapping keeps the joint positions at which the robot began to follow the person.
         """
@@ -86,7 +85,7 @@ class JointMapping:
             self._person = theta0 + self.sense * (self._q - q0)
 
     def joints(self, estimate: ArmEstimate, clutch: Clutch) -> Array:
-        """Return the robot's joint positions for one frame of the person's arm, before any limit, shape (7,) [rad].
+        """Return the robot's joint positions for one estimate of the person's arm, without limits, shape (7,) [rad].
 
         Args:
             estimate: estimate of the person's arm.
@@ -125,8 +124,8 @@ class JointMapping:
 
         Args:
             theta: the person's angles, shape (7,) [rad].
-            hand: desired rotation of the robot's hand, shape (3, 3): the desired rotation of the tool, times the
-                inverse of the tool's rotation in the posture :attr:`zero`.
+            hand: desired rotation of the tool relative to its rotation in the posture :attr:`zero`, in the base frame,
+                shape (3, 3).
         """
         begins = self._origin is None
         if self._origin is None:
@@ -147,12 +146,12 @@ class JointMapping:
 
 
 class Approach:
-    """Moves to the first goal at limited speed, even if it is far away, and then follows the mapping.
+    """Moves the joints to a goal at limited speed; after the first arrival, it returns every goal unchanged.
 
     Args:
-        arm: arm that provides the velocity limits.
+        arm: arm with the velocity limits of the joints.
         dt: control period [s].
-        fraction: speed of the approach as a fraction of the velocity limits.
+        fraction: largest joint speeds before the arrival, as a fraction of the velocity limits.
     """
 
     def __init__(self, arm: ArmModel, dt: float, fraction: float = 0.6) -> None:
@@ -162,7 +161,7 @@ class Approach:
     def towards(self, q: Array, goal: Array) -> Array:
         """Return the joint positions one control period after ``q``.
 
-        The result is a step towards ``goal``, or ``goal`` itself once it has been reached.
+        Before the first arrival, this is a step towards ``goal``; afterwards, it is ``goal``.
         """
         if self.active:
             reached = q + np.clip(goal - q, -self._most, self._most)
@@ -172,7 +171,7 @@ class Approach:
 
 
 def continued(angles: Array, before: Array) -> Array:
-    """Add multiples of 360 degrees to angles (n,) [rad], so that each is as close as possible to its previous value."""
+    """Add multiples of 2 pi to angles (n,) [rad], so that each is as close as possible to ``before`` (n,)."""
     return np.asarray(before + (angles - before + np.pi) % (2.0 * np.pi) - np.pi)
 
 

@@ -1,4 +1,4 @@
-"""NURBS: rational spline curves (thesis Eq 3.6 and 3.7), and a weighted, smooth and robust fit to noisy samples."""
+"""NURBS: rational spline curves (thesis Eq 3.6 and 3.7), and their fit to noisy samples of a motion."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Indices = NDArray[np.intp]
 Smoothing = float | str
 
 SMOOTHINGS = ("gcv", "morozov")
-"""Names of the rules that choose the smoothing weight mu."""
+"""Names of the rules that choose the weight mu of the smoothing."""
 
 _MU = (-6.0, 6.0)  # decades to search
 _HUBER, _PASSES = 2.5, 3  # an outlier is farther than 2.5 sigma; number of reweightings
@@ -36,17 +36,17 @@ def basis_functions(knots: Array, degree: int, u: ArrayLike) -> tuple[Indices, A
         + \frac{u_{i+p+1} - u}{u_{i+p+1} - u_{i+1}} N_{i+1,p-1}(u)
 
     where 0/0 = 0. The last knot span includes its right end, so that the last function is 1 at the end of the curve. At
-    every ``u``, only p + 1 functions are non-zero. The recursion computes only the non-zero functions, for which no
-    divisor is zero.
+    every ``u``, only p + 1 functions are non-zero, and only these are computed.
 
     Args:
-        knots: non-decreasing knots, shape (m,); the first and the last knot each occur degree + 1 times.
+        knots: non-decreasing knots, shape (m,); the first degree + 1 knots are equal, and the last degree + 1 knots are
+            equal.
         degree: degree p of the curve.
-        u: parameters, shape (k,); clipped to the range of the knots.
+        u: parameters, shape (k,); values outside the range of the knots are clipped.
 
     Returns:
-        Indices of the first non-zero function, shape (k,), and the values of this and the following functions, shape
-        (k, degree + 1).
+        The index of the first non-zero function at each parameter, shape (k,); and the values of this function and of
+        the following ``degree`` functions, shape (k, degree + 1).
     """
     at = np.minimum(np.maximum(np.asarray(u, dtype=float), knots[degree]), knots[-degree - 1])
     span = np.searchsorted(knots[degree + 1 : -degree - 1], at, side="right") + degree
@@ -74,14 +74,13 @@ class NURBS:
     knot has the index m. For a curve that is fitted to a motion, the parameter u is the time [s].
 
     Attributes:
-        knots: shape (n + degree + 1,).
-        control_points: P, shape (n, d).
-        weights: w, positive, shape (n,).
-        degree: p, at least 1.
+        knots: the knots, not decreasing, shape (n + degree + 1,).
+        control_points: control points P, shape (n, d).
+        weights: weights w of the control points, positive, shape (n,).
+        degree: degree p, at least 1.
 
     Raises:
-        InputError: when shapes do not match, a weight is not positive, or the knots decrease, are not repeated at both
-            ends, or are repeated too often in between.
+        InputError: when shapes do not match, a weight is not positive, or the knots are not as described above.
     """
 
     knots: Array
@@ -113,11 +112,11 @@ class NURBS:
 
     @property
     def domain(self) -> tuple[float, float]:
-        """The smallest and the largest parameter of the curve."""
+        """The smallest and the largest parameter u of the curve."""
         return float(self.knots[0]), float(self.knots[-1])
 
     def evaluate(self, u: ArrayLike) -> Array:
-        """Return the points of the curve at ``u`` (k,), shape (k, d); beyond the ends the curve is constant.
+        """Return the points of the curve at ``u`` (k,), shape (k, d); beyond its ends, the curve is constant.
 
         If ``u`` is a single number, the result is one point, shape (d,).
         """
@@ -135,9 +134,9 @@ class NURBS:
         \frac1W \bigl(A^{(r)} - \sum_{j=1}^r \binom rj W^{(j)} C^{(r-j)}\bigr)`.
 
         Args:
-            u: parameters, shape (k,); for a single number, the result has shape (d,). Beyond the ends of the curve, the
-                derivative at the end is returned.
-            order: 0 (the point itself) to ``degree``.
+            u: parameters, shape (k,), or a single number, for which the result has the shape (d,). Values beyond the
+                ends of the curve are clipped.
+            order: order r of the derivative, from 0 (the point itself) to ``degree``.
 
         Raises:
             InputError: when the order is out of range.
@@ -167,7 +166,7 @@ class NURBS:
 
 
 def averaged_knots(u: Array, n_control: int, degree: int) -> Array:
-    """Return knots spaced like the data, so that every knot span contains data (Piegl and Tiller, Eq 9.69).
+    """Return knots that are distributed like the data, with data in every knot span (Piegl and Tiller, Eq 9.69).
 
     Args:
         u: parameters of the data, increasing, shape (k,), with k at least ``n_control``.
@@ -237,25 +236,25 @@ def fit_nurbs(
     .. math:: \min_P \sum_k c_k \Bigl|\sum_i R_{ik} P_i - Q_k\Bigr|^2 + \mu \sum_j |(D P)_j|^2,
         \qquad R_{ik} = \frac{N_i(t_k)\, w_i}{\sum_j N_j(t_k)\, w_j}
 
-    where D is the matrix of second differences from :func:`bends`. The parameter is the time, not the chord length,
-    because the speed is part of the motion. The normal equations have a band matrix of width p, so the computing time
-    grows linearly with the number of samples. The rule ``"gcv"`` takes longer because it needs the inverse of the band
-    matrix.
+    Here, :math:`Q_k` are the samples at the times :math:`t_k` and :math:`c_k` their confidences. D is the matrix of
+    second differences from :func:`bends`, so the second term makes the curve smooth. The parameter of the curve is the
+    time instead of the chord length, because the speed is a part of the motion. The computing time grows linearly with
+    the number of samples, except for the rule ``"gcv"``, which needs the inverse of a matrix.
 
     Args:
         times: times of the samples, strictly increasing, shape (k,) [s].
-        points: sample points Q, shape (k, d); a point whose confidence is 0 is ignored and may be nan.
+        points: samples Q, shape (k, d); a sample with the confidence 0 is ignored and may be nan.
         confidence: confidence c of each sample, 0 to 1, shape (k,); None: all 1.
         degree: degree p of the curve.
         n_control: number of control points; None: k/4 + p, for k samples and degree p.
-        smoothing: the weight :math:`\mu`, or a rule that chooses it: ``"gcv"``: generalised cross-validation, which
-            assumes independent errors; ``"morozov"``: the weight with which the residual equals ``sigma``.
+        smoothing: the weight :math:`\mu`, or a rule that chooses it. ``"gcv"``: generalised cross-validation, for
+            independent errors. ``"morozov"``: the weight with which the root mean square of the residuals on one axis
+            equals ``sigma``.
         sigma: standard deviation of the samples' errors on each axis, in the unit of the points; None: it is estimated
             from the residuals.
-        robust: whether to reduce the weight of samples that are farther than 2.5 sigma from the curve (Huber weights),
-            in three passes.
-        rational: whether to fit the weights w too, which are then between 0.2 and 5 with mean 1; otherwise, all weights
-            are 1. Fitted weights are needed only for exact circular arcs.
+        robust: whether samples farther than 2.5 ``sigma`` from the curve get a smaller weight (Huber weights).
+        rational: whether to fit the weights w, too, with values between 0.2 and 5 and the mean 1. If False, all weights
+            w are 1. Only exact circular arcs need other weights.
 
     Raises:
         InputError: when shapes do not match, times do not increase, fewer than p + 1 samples have a confidence above 0,
@@ -330,16 +329,16 @@ def _check_options(smoothing: Smoothing, sigma: float | None) -> None:
 
 
 def bends(knots: Array, degree: int) -> Array:
-    r"""Return the second differences D of the control points, shape (n - 2, 3); row j acts on points j, j+1, j+2.
+    r"""Return the coefficients of the second differences D, shape (n - 2, 3); row i acts on control points i, i+1, i+2.
 
     Each control point corresponds to the parameter :math:`g_j = (u_{j+1} + \dots + u_{j+p}) / p`, the mean of p knots.
-    The parameters :math:`g_j` are denser near the ends of the curve. Near the ends, plain differences :math:`P_{j+1} -
-    2 P_j + P_{j-1}` would not vanish for a straight uniform motion, so a fit would slow this motion down. The second
-    differences are therefore computed as divided differences,
+    Near the ends of the curve, the parameters :math:`g_j` are closer together than elsewhere. Plain differences
+    :math:`P_{j+1} - 2 P_j + P_{j-1}` would therefore not be zero there for a straight uniform motion, so a fit would
+    slow this motion down. The second differences are divided differences instead, with j = i + 1:
 
     .. math:: h \left( \frac{P_{j+1} - P_j}{g_{j+1} - g_j} - \frac{P_j - P_{j-1}}{g_j - g_{j-1}} \right)
 
-    where h is the mean distance of successive :math:`g_j`. For uniform knots, the divided differences equal the plain
+    Here, h is the mean distance between successive :math:`g_j`. For uniform knots, the result is the same as plain
     differences.
     """
     means = np.convolve(knots[1:-1], np.full(degree, 1.0 / degree), "valid")

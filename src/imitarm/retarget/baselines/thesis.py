@@ -1,4 +1,4 @@
-"""ThesisRetargeter: the method of Chapter 3 of the thesis, corrected, or with selected misprints of the thesis."""
+"""ThesisRetargeter: the method of Chapter 3 of the thesis, with its misprints corrected or reproduced."""
 
 from __future__ import annotations
 
@@ -50,31 +50,31 @@ PRINTED = {
     "damping": "Eq 3.9 uses the whole remaining error, so the arm is slower when the target is farther away",
     "small_angle": "The small-angle term after Eq 3.9 gives less damping than the velocity limit needs",
 }
-"""The misprints that can be reproduced, by the names that ``as_printed`` accepts."""
+"""The misprints that :class:`ThesisRetargeter` can reproduce, by their names in ``as_printed``."""
 
 _UNLIMITED = 1e6  # [m/s] a limit that no twist reaches
 _UNSEEN = 0.2  # weight of a hand rotation that was not seen but moved with the forearm
 
 
 class HumanArmTracker:
-    r"""Tracks a person's arm in joint angles (thesis 3.1.1 and 3.1.2).
+    r"""Computes the joint angles of a person's arm in each frame (thesis 3.1.1 and 3.1.2).
 
-    In each frame, the tracker starts from the angles :math:`\tau` of the previous frame.
-
-    The tracker repeats the following update one to three times per frame:
+    In each frame, the tracker starts from the angles :math:`\tau` of the previous frame, and updates them several
+    times:
 
     .. math:: \tau \leftarrow \tau + J^+ \varepsilon, \qquad
         \varepsilon = \begin{pmatrix} p_d - p(\tau) \\ \log(R_d R(\tau)^T) \end{pmatrix}
 
-    where :math:`p_d, R_d` are the corrected wrist position and hand rotation, and J is the Jacobian of the person's
-    arm. The pseudo-inverse :math:`J^+` ignores directions in which a straight arm can't move. In the first frame, and
-    in the first frame after a gap, the angles are computed in closed form.
+    where :math:`p_d, R_d` are the measured wrist position and hand rotation, with corrected bone lengths.
+    :math:`p(\tau), R(\tau)` are those of an arm with the angles :math:`\tau`, and J is the Jacobian of this arm. The
+    pseudo-inverse :math:`J^+` ignores directions in which a straight arm can't move. In the first frame, and in the
+    first frame after a gap, the tracker starts from angles that are computed in closed form.
 
     Attributes:
         angles: joint angles tau of the person's arm, shape (7,) [rad]; None before the first frame.
 
     Args:
-        iterations: number of updates per frame.
+        iterations: largest number of updates per frame.
         faults: misprints from :data:`PRINTED` to reproduce; only ``"limbs"``, ``"dh"``, ``"error"``, ``"rpy"`` and
             ``"step"`` affect this class.
     """
@@ -90,7 +90,7 @@ class HumanArmTracker:
         self._time = -math.inf
 
     def follow(self, estimate: ArmEstimate, lengths: LimbLengths) -> tuple[Array, Array]:
-        """Process a frame; return wrist (3,) [m] and hand quaternion (4,) of the tracked arm in the base frame.
+        """Update the angles; return wrist (3,) [m] and hand quaternion (4,) for these angles, in the base frame.
 
         Args:
             estimate: estimate of the arm, with true bone lengths.
@@ -142,8 +142,8 @@ class HumanArmTracker:
 def roll_pitch_yaw(rotation: Array) -> Array:
     """Return roll, pitch and yaw of a rotation Rz(yaw) Ry(pitch) Rx(roll), shape (3,) [rad].
 
-    The thesis uses differences of roll, pitch and yaw as the orientation error. Differences of roll, pitch and yaw are
-    not a rotation vector, wrap at 180 degrees, and are singular at a pitch of 90 degrees.
+    The thesis uses differences of roll, pitch and yaw as the orientation error. These differences are not a rotation
+    vector, jump at 180 degrees, and are singular at a pitch of 90 degrees.
     """
     pitch = math.atan2(-rotation[2, 0], math.hypot(rotation[0, 0], rotation[1, 0]))
     return np.array(
@@ -178,34 +178,33 @@ class ThesisRetargeter(Retargeter):
     For each skeleton
 
     1. the bones get their true lengths (Eq 3.1 to 3.4);
-    2. the person's joint angles are tracked by increments :math:`\tau \leftarrow \tau + J^+ \varepsilon`
-       (:class:`HumanArmTracker`); Denavit-Hartenberg forward kinematics (Eq 3.5) then gives the pose of the hand
-       relative to the shoulder, which is transformed to the robot's base frame;
-    3. a NURBS is fitted to the last 0.6 s and evaluated 70 ms in the past (Eq 3.6 and 3.7,
+    2. the person's joint angles are tracked (:class:`HumanArmTracker`); forward kinematics with Denavit-Hartenberg
+       parameters (Eq 3.5) then gives the pose of the hand in the robot's base frame;
+    3. a NURBS curve is fitted to the hand's motion of the last 0.6 s and evaluated 70 ms in the past (Eq 3.6 and 3.7,
        :class:`~imitarm.retarget.baselines.hand_curve.DelayedCurve`).
 
     In each control step, the tool moves towards the curve by damped least squares with Baerlocher's damping (Eq 3.8 and
-    3.9). The length of every step is limited, because the damping of a long step would stop the arm. Joint positions
-    and velocities stay within their limits. Like the thesis, the method does not handle accelerations, the elbow,
-    obstacles or tracking losses. When the person is lost, the target therefore stays where it is, and jumps when the
-    person returns.
+    3.9). The length of the step is limited, because the damping grows with this length and would stop the arm. Joint
+    positions and velocities stay within their limits. As in the thesis, accelerations, the position of the elbow,
+    obstacles and tracking losses are not handled. If the camera loses the person, the target stays at its last pose.
+    When the camera finds the person again, the target jumps.
 
     Args:
         arm: the robot's arm with its tool.
         correspondence: how the person's motion maps to the robot: side, sensor pose, scale and orientation.
         dt: control period [s].
         scene: ignored.
-        small_angle: None: damping as in Eq 3.9; ``"thesis"``: damping with the small-angle term that the thesis prints
-            after Eq 3.9.
-        as_printed: names of the misprints in :data:`PRINTED` to reproduce; True: all misprints. With any of the
-            misprints, the arm stays within its limits.
-        smoothing: ``"live"``: a curve is fitted to the last 0.6 s; ``"global"``: :meth:`run` fits one curve to the
-            whole recording, without lag, but :meth:`step` uses a live curve; None: no curve.
-        lag: the live curve is evaluated this long before the current time [s].
-        iterations: number of increments of the person's joint angles per frame.
-        gain: gain K of the tool's twist :math:`K \log(T_d T^{-1})` [1/s]; the default is the inverse of the frame
-            period.
-        max_speed: largest norm of the twist [m/s], with 1 rad counted as 0.3 m.
+        small_angle: None: damping as in Eq 3.9; ``"thesis"``: damping with the additional term for small angles that
+            follows Eq 3.9 in the thesis.
+        as_printed: names of the misprints in :data:`PRINTED` that are reproduced; True: all; False: none. Even then,
+            the arm stays within its limits.
+        smoothing: ``"live"``: a curve is fitted to the last 0.6 s. ``"global"``: :meth:`run` fits one curve to the
+            whole recording and evaluates it without lag; :meth:`step` works as with ``"live"``. None: no curve.
+        lag: time between the evaluated point of the live curve and the current time [s].
+        iterations: largest number of updates of the person's joint angles per frame.
+        gain: gain K [1/s] of the tool's twist :math:`K \log(T_d T^{-1})`, where T is the tool's pose and :math:`T_d`
+            its target; the default is the usual frame rate of the camera.
+        max_speed: largest norm of the twist [m/s]; a rotation of 1 rad counts as 0.3 m.
 
     Raises:
         InputError: when a number is out of range.
@@ -255,7 +254,7 @@ class ThesisRetargeter(Retargeter):
         return ArmEstimator(self.correspondence, smoothing=False, limbs="direction")
 
     def run(self, skeletons: Iterable[Skeleton], q: ArrayLike | None = None) -> Retargeting:
-        """Retarget a whole recording; ``smoothing="global"`` fits one curve to the whole recording.
+        """Retarget a whole recording; with ``smoothing="global"``, one curve is fitted to the whole recording.
 
         Args:
             skeletons: skeletons in order of time.
