@@ -263,7 +263,7 @@ def test_the_time_in_the_learned_motion_and_the_phase_are_inverse():
     _, arm, _ = carrying("sawyer")
     tool = arm.tool_pose(plan.joints_at(2.5))
     assert plan.off_schedule(arm, 2.5, at(arm, plan.joints_at(2.5)), tool, 0.01) == ""
-    assert "mm from where it should be" in plan.off_schedule(arm, 3.5, at(arm, plan.joints_at(2.5)), tool, 0.01)
+    assert "mm from its planned position" in plan.off_schedule(arm, 3.5, at(arm, plan.joints_at(2.5)), tool, 0.01)
 
 
 # ----- the policy, on an arm that moves exactly as commanded

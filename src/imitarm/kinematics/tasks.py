@@ -1,8 +1,8 @@
 r"""Tasks of the inverse kinematics: desired motions, as small objects that can be combined.
 
-Let :math:`v` be the joint velocity. A task is about a quantity that moves with :math:`J v`, for example the pose of the
-tool, and sets the target velocity :math:`t` of this quantity. The solver minimises the sum of :math:`\tfrac12 |J v -
-t|^2` over all tasks, within the limits of the joints.
+Let :math:`v` be the joint velocity. A task sets the target velocity :math:`t` of a quantity that moves with :math:`J
+v`, for example of the tool's pose. The solver minimises the sum of :math:`\tfrac12 |J v - t|^2` over all tasks, within
+the limits of the joints.
 """
 
 from __future__ import annotations

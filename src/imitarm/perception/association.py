@@ -157,9 +157,9 @@ def squared_distances(first: Array, second: Array) -> Array:
 def unlikeness(first: Sequence[Solid], second: Sequence[Solid], sizes: Array) -> Array:
     """Return how much the shapes of k tracks and k detections differ, shape (k,); 0 for equal shapes, at most 9.
 
-    Shapes of different kinds, such as a sphere and a box, differ by 4, because a camera can confuse them. For shapes of
-    one kind, the difference is the squared difference of size, in units of 20 mm, plus the squared angle between the
-    rotations, in units of 0.4 rad.
+    Shapes of different kinds, such as a sphere and a box, differ by 4. They may still be one obstacle, because a camera
+    can confuse the kinds. For shapes of the same kind, the result is a sum of two squares: of the difference of size
+    divided by 20 mm, and of the angle between the rotations divided by 0.4 rad.
 
     Args:
         first: shapes of the tracks, as last detected.

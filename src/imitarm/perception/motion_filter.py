@@ -304,8 +304,8 @@ class MotionFilter:
     def update(self, belief: Belief, measured: Measurements, innovation: Innovation | None = None) -> Belief:
         """Return the beliefs after each obstacle has been measured once.
 
-        The method pads the matrices with 3 rows or columns to the size of the state, because NumPy multiplies
-        contiguous matrices faster than parts of larger matrices.
+        Matrices with 3 rows or columns are padded to the size of the state. NumPy multiplies such contiguous matrices
+        faster than parts of larger matrices.
 
         Args:
             belief: beliefs about k obstacles.

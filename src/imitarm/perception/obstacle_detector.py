@@ -199,9 +199,9 @@ class ObstacleDetector:
     def camera_error(self, frame: Frame) -> str:
         """Check the pose of the camera that the frame states; return a message about an error, or an empty string.
 
-        If somebody has moved a camera, the known surfaces appear at wrong places. The method reports two signs of this.
-        First, many rays go through known surfaces. Second, hardly any point lies on the plane of a known half-space or
-        on the upper face of a known box, and the measured plane is more than 3 cm or 4 degrees away from it.
+        If somebody has moved a camera, the known surfaces appear at wrong places. The method looks for two such errors.
+        First, many rays go through known surfaces. Second, the plane of a known half-space, or the upper face of a
+        known box, contains hardly any points, and the measured plane is more than 3 cm or 4 degrees away.
 
         Args:
             frame: depth image or point cloud.

@@ -44,7 +44,7 @@ def fit_shape(
     A shape is rejected if more than a quarter of its surface lies in space that the camera saw to be empty. If every
     shape is rejected, or if the points are much farther from the best shape than the noise explains, the convex hull of
     the points is used. The radius of a sphere, cylinder or capsule is enlarged by its standard deviation. If the object
-    appears wider than that in the image, the radius is enlarged by up to three standard deviations.
+    in the image is even wider, the radius is enlarged by up to three standard deviations.
 
     Then the ends and faces that the camera did not see are moved outwards, until the shape reaches empty space. The
     extension is at most the size of the visible part, and at most 0.3 m. Finally, the shape is enlarged until no

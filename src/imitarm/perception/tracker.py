@@ -91,8 +91,8 @@ class ObstacleTracker:
         max_obstacles: largest number of tracks, and of detections in one update.
         initial_speed: standard deviation of each component of a new track's velocity [m/s].
         history: largest age of a late update, relative to the newest update [s].
-        rotations: whether angular velocities are estimated; otherwise they are 0. If they are estimated, a policy that
-            guarantees clearance plans around the sphere that encloses a rotating obstacle.
+        rotations: whether angular velocities are estimated; otherwise they are 0. A policy that guarantees its
+            clearance replaces an obstacle with an angular velocity by a sphere around it.
 
     Raises:
         InputError: when an argument is out of its range.

@@ -106,9 +106,9 @@ def adapt(
         tool_radius: radius of one sphere about the tip that represents the tool [m]; 0 for a point.
         tool_spheres: spheres that contain the tool: rows x y z r in the tool's frame, shape (m, 4) [m]. On the path,
             the spheres have the learned orientation of the tool.
-        arm: the arm with its tool. The function then plans a joint path on which every moving part of the arm keeps the
-            clearance and the links stay at least 12 mm apart. The motion is slower than learned where the velocity or
-            acceleration limits of the arm require it.
+        arm: the arm with its tool. The function then plans a joint path. On this path, every moving part of the arm
+            keeps the clearance, and the links stay at least 12 mm apart. The motion is slower than learned where the
+            velocity or acceleration limits of the arm require it.
         clearance: required distance from the tool, or from the whole arm, to every obstacle [m].
         forbidden: directions in which no component may move, shape (m, 3), for example ``HORIZONTAL_ONLY`` or
             ``NOT_DOWN``.
@@ -129,7 +129,7 @@ def adapt(
             obstacles that move or that a tracker estimates. The path keeps the distance ``clearance + margin.at(t)``
             from the prediction, where t [s] is the time since the obstacle was last detected. None: predictions count
             as exact.
-        margin_horizon: time after the last detection of an obstacle at which the margin stops to grow [s]; None: never.
+        margin_horizon: time after the last detection of an obstacle at which the margin stops growing [s]; None: never.
         hold: the whole arm must keep its clearances at the goal for this long after the arrival [s].
         max_attempts: largest number of attempts in the search for a joint path, to limit the computing time; None: no
             limit. The search may also try to execute the path later, after an obstacle has passed; such attempts are
@@ -324,7 +324,7 @@ def of_whole_arm(
         jerk_ratio=jerk,
         jerk_reason=""
         if jerk <= MAX_JERK_RATIO
-        else f"the whole arm needs {jerk:.0f} times the jerk of the nominal path",
+        else f"the jerk of the planned path is {jerk:.0f} times that of the nominal path; execute it more slowly",
         feasible=not solution.reason,
         reason=solution.reason,
         compute_time=spent,
@@ -381,7 +381,7 @@ def _spheres(path: ComponentPath, radius: float | None, spheres: ArrayLike | Non
 
 
 def allowed_directions(forbidden: ArrayLike) -> AllowedDirections:
-    """Return the directions in which components may move; ``forbidden`` are the other directions, shape (m, 3).
+    """Return the directions in which components may move, for forbidden directions of the shape (m, 3).
 
     Raises:
         InputError: when a direction is zero or not finite.

@@ -41,7 +41,7 @@ class Adaptation:
         responsibilities: responsibilities ``h_k`` of the components at the n samples of the path, shape (n,
             n_components).
         divided: whether the learned components were too wide for this scene and were divided into narrower components.
-            If so, the arrays above describe the narrower components.
+            If True, the arrays above describe the narrower components.
         tolerance: covariance of the demonstrated positions along the path, shape (n, 3, 3) [m^2].
         min_clearance: smallest distance from the tool's spheres to an obstacle, at the samples [m]; inf without
             obstacles. If an obstacle has a margin for its prediction error, the margin is subtracted from its distance.

@@ -76,9 +76,9 @@ class ArmAmongObstacles:
         obstacles: convex obstacles at time 0, which move at their velocities. A rotating obstacle is replaced by a
             sphere about its centre that contains it.
         clearance: required distance from every moving part of the arm to every obstacle [m].
-        fixtures: objects on which the arm stands or works, such as a table. A part of the arm that is nearer to a
-            fixture than ``clearance`` in the home posture, or in a posture of ``contacts``, may always come as near as
-            in this posture. All other parts keep the clearance.
+        fixtures: objects on which the arm stands or works, such as a table. In the home posture and in the postures
+            ``contacts``, parts of the arm may be nearer to a fixture than ``clearance``. On the path, such a part may
+            come as near as in these postures. All other parts keep the clearance.
         contacts: postures in which parts of the arm are meant to be near fixtures, shape (k, n_joints) [rad].
         own: the pairs of links that must stay apart, and their required clearance; None: these distances are not
             checked.

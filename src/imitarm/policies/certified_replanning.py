@@ -93,7 +93,7 @@ class CertifiedRCAMO(Policy):
         rate: number of plans per second [Hz].
         margin: a ``CoverageMargin``, which bounds the error of the predicted obstacle positions; None: predictions
             count as exact.
-        margin_horizon: time after the last detection of an obstacle at which the margin stops to grow [s]; None: never.
+        margin_horizon: time after the last detection of an obstacle at which the margin stops growing [s]; None: never.
             Choose a time that covers the next few plans and the braking.
         planning_time: time from an observation until the arm follows the plan that was made from this observation [s].
         max_tilt: see :func:`~imitarm.policies.adapt`.
@@ -272,7 +272,7 @@ class CertifiedRCAMO(Policy):
             self._arm, time, observation.state, observation.tool_to_base, 0.5 * max(self.clearance, 0.01)
         )
         ends = time > plan.until - _HORIZON + self._period
-        reason = late or plan.unforeseen(scene) or ("the certificate of the plan ends" if ends else "")
+        reason = late or plan.unforeseen(scene) or ("the guaranteed clearance of the plan ends" if ends else "")
         if reason and not late:
             again = plan.certified_again(self._arm, scene, margins_in(scene, **self._margin), self._hold, _HORIZON)
             if again is not None:

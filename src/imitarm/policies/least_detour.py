@@ -278,8 +278,8 @@ class LeastDetour:
         the samples. A little more distance there would need very large displacements.
 
         Args:
-            start: distances along the path at which the first tangents are computed. This can be any path; components
-                need not be able to produce it.
+            start: distances along the path at which the first tangents are computed. This can be any path, also one
+                that no displacement of the components produces.
             moved: indices of the components that may move; None: all.
             smoothness: weight of the squared jerk of the displacement; None: 0.001 if ``exact``, otherwise 0.
         """

@@ -6,8 +6,8 @@ enlarged obstacle. Enlarged obstacles are convex, so the whole cell is then insi
 start, the pinned points and the goal of the path, there is no path. Otherwise, the cheapest chain proposes a path. Such
 a path may reach positions that no straight ray from the nominal path reaches, for example out of a shelf.
 
-The grid does not depend on time, so it contains only obstacles at rest. Its tool is the largest of the spheres with the
-centre at the tip; without such a sphere, the grid is not used.
+The grid does not depend on time, so it contains only obstacles at rest. The largest of the tool's spheres with the
+centre at the tip represents the tool. If there is no such sphere, the grid is not used.
 """
 
 from __future__ import annotations

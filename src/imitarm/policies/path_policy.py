@@ -91,8 +91,8 @@ class PathPolicy(Policy):
     Here, ``p`` and ``R`` are the measured position and rotation of the tool, and ``p_d`` and ``R_d`` are their desired
     values at the phase ``s`` [s]. The rate ``r`` of the phase decreases if the tool lags behind, for example because of
     its speed limits or because a hand holds it. The feedback moves the tool along the straight line to the desired
-    position. While the phase moves, this line is shorter than ``e_0``. If ``e_0`` is the required clearance, and tool
-    and desired position keep it, every point of the line therefore keeps at least half of it.
+    position. While the phase moves, this line is shorter than ``e_0``. Let ``e_0`` be the required clearance. If the
+    tool and its desired position keep this clearance, every point of the line keeps at least half of it.
 
     If obstacles move, a plan may be valid only at the planned times. The phase is then the time since the start, and
     does not wait. As soon as the tool is farther than ``e_0 / 2`` from its planned position, the plan becomes invalid,

@@ -158,7 +158,7 @@ class PlanInExecution:
         """
         lag = float(np.linalg.norm(arm.tool_pose(self.joints_at(time)).position - tool.position))
         if lag > patience:
-            return f"the tool is {1e3 * lag:.0f} mm from where it should be at {time:.2f} s"
+            return f"the tool is {1e3 * lag:.0f} mm from its planned position at {time:.2f} s"
         return ""
 
     def unforeseen(self, scene: Scene) -> str:
@@ -187,7 +187,7 @@ class PlanInExecution:
         if away[worst] <= allowed[worst]:
             return ""
         return (
-            f"{scene.name_of(worst)} is {1e3 * away[worst]:.0f} mm from where it was predicted "
+            f"{scene.name_of(worst)} is {1e3 * away[worst]:.0f} mm from its predicted position "
             f"({1e3 * allowed[worst]:.0f} mm allowed)"
         )
 

@@ -71,7 +71,7 @@ def margins_in(
         scene: obstacles at the start of a plan. ``scene.packed.stamps`` contains the time of each obstacle's last
             detection.
         margin: bound of the prediction error; None: predictions count as exact.
-        margin_horizon: time after the last detection of an obstacle at which the margin stops to grow [s]; None: never.
+        margin_horizon: time after the last detection of an obstacle at which the margin stops growing [s]; None: never.
 
     Raises:
         InputError: when an argument is not valid.

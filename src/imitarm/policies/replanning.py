@@ -69,7 +69,7 @@ def replan(
         allowance: additional clearance for tracking errors [m]. If ``previous`` or the new path does not have this
             additional clearance, the function plans without it.
         margin: bound of the error of the predicted obstacle positions; see :func:`adapt`.
-        margin_horizon: time after the last detection of an obstacle at which the margin stops to grow [s]; see
+        margin_horizon: time after the last detection of an obstacle at which the margin stops growing [s]; see
             :func:`adapt`.
         hold: time for which the whole arm must keep its clearances at the goal after the arrival [s].
         max_attempts: largest number of attempts in the search for a joint path, to limit the computing time; None: no

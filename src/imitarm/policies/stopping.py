@@ -75,7 +75,7 @@ def certified_stop(
         clearance: required distance from the whole arm to every obstacle [m].
         horizon: time from now for which the clearance must be guaranteed [s].
         margin: bound of the error of the predicted obstacle positions; see :func:`~imitarm.policies.adapt`.
-        margin_horizon: time after the last detection of an obstacle at which the margin stops to grow [s]; None: never.
+        margin_horizon: time after the last detection of an obstacle at which the margin stops growing [s]; None: never.
 
     Raises:
         InputError: when an argument is not valid.

@@ -11,9 +11,9 @@ motion least:
 6. the best failed plans again, with narrower components.
 
 If a plan takes much longer than the learned motion, the search makes a few more attempts and returns the fastest plan.
-If the plan is slow because the tool passes close to an obstacle, the search tries only other paths of the tool, because
-other postures would not help. If no attempt succeeds, the reason names the link and the obstacle that come too close in
-the best attempt, and the time.
+The plan may be slow because the tool passes close to an obstacle. Then other postures would not help, and the search
+tries only other paths of the tool. If no attempt succeeds, the reason names the link and the obstacle that come too
+close in the best attempt, and the time.
 """
 
 from __future__ import annotations

@@ -303,7 +303,7 @@ class SensorFit:
         return self.rms <= GOOD and self.suspect is None
 
     def notes(self) -> list[str]:
-        """Return advice for the user, one line for each problem of the fit."""
+        """Return one line of text for each problem of the fit, which says what the user can do."""
         lines = []
         if self.flat:
             lines.append(

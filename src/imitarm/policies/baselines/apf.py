@@ -83,7 +83,7 @@ class APF(BaselinePolicy):
         return _Field(self, gaps, nominal.positions[-1], stiffness, moving=moving)
 
     def reaction(self, nominal: Trajectory, position: Array, velocity: Array, fraction: float) -> Reaction:
-        """Return a motion along the forces that advances by one control period at a time."""
+        """Return the motion along the forces in a changing scene, which is computed one control period at a time."""
         return _FieldReaction(self, nominal, position, velocity, fraction)
 
     def tool_path(self, nominal: Trajectory, gaps: ToolGaps, scene: Scene) -> tuple[Array, Array]:

@@ -116,7 +116,7 @@ class CoupledMotion(BaselinePolicy):
         return after
 
     def reaction(self, nominal: Trajectory, position: Array, velocity: Array, fraction: float) -> Reaction:
-        """Return a motion of the primitive that advances by one control period at a time."""
+        """Return the motion of the primitive in a changing scene, which is computed one control period at a time."""
         return _CoupledReaction(self, nominal, position, velocity, fraction)
 
     def target(self, nominal: Trajectory, fractions: Array) -> Array:

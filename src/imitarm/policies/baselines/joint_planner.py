@@ -11,8 +11,8 @@ for all :math:`s` in [0, 1]. Here, d is any distance between the arm and an obst
 :math:`d_{req}` is the required clearance. The module ``arm_certificate`` computes lower bounds of these distances on
 the whole edge. R is the rotation of the tool, and :math:`R_0` is the learned rotation at the nearest point of the
 learned path. The angle between the two, the tilt, is checked at samples of the edge against its limit :math:`\tau`. The
-planner uses nothing else from the demonstrations. A comparison with this baseline shows what it costs to follow the
-demonstrated motion, and what one gains.
+planner uses nothing else from the demonstrations. A comparison with this baseline shows the costs and the benefits of
+following the demonstrated motion.
 
 The library ompl grows the trees. The code that checks the edges is written in Python, with array operations over all
 samples of an edge. Most of the planning time is spent in this code, not in ompl.
@@ -243,7 +243,7 @@ class RRTConnect(PathPolicy):
             around = _surroundings(arm, scene, self.clearance + allowance, learned, q)
             clear = ClearMotions(around, tilt)
             if not clear.posture(q):
-                reason = "the arm is not clear in its start posture: move the obstacle or the arm"
+                reason = "in its start posture, the arm is too close to an obstacle: move the obstacle or the arm"
                 continue
             goals = _goal_postures(around, learned.pose(len(learned) - 1), q)
             left = until - time.process_time()

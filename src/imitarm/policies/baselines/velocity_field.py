@@ -164,7 +164,7 @@ class VelocityField(BaselinePolicy):
         return x + dt * (fixed + self.axes @ v), ahead
 
     def reaction(self, nominal: Trajectory, position: Array, velocity: Array, fraction: float) -> Reaction:
-        """Return a motion in the velocity field that advances by one control period at a time."""
+        """Return the motion in a changing scene, which is computed one control period at a time."""
         return _FieldReaction(self, nominal, position, velocity, fraction)
 
     def _obstacles(self, x: Array, time: float, fixed: Array, gaps: ToolGaps, packed: PackedObstacles) -> NearObstacles:

@@ -224,8 +224,8 @@ class AdaptiveLaw:
 class AdaptiveControl(BaselineRetargeter):
     r"""Baseline M2: our interpretation of "discrete-time adaptive control" in the thesis.
 
-    The thesis refers to Liang et al. 2016. We know only the abstract of this paper. It describes a controller of a
-    simulated Baxter arm in discrete time, with arm angles computed from Kinect data and a stiffness that depends on the
+    The thesis refers to Liang et al. 2016. We know only the abstract of this paper. It describes a discrete-time
+    controller of a simulated Baxter arm. The arm angles are computed from Kinect data, and the stiffness depends on the
     hand's gesture. We use a discrete form of the controllers of Yang et al. 2011 and Li and Burdet 2016, which resemble
     human motor control.
 

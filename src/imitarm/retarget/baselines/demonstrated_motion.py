@@ -161,9 +161,9 @@ def upright(angle: float) -> Constraint:
 class FeasibilityCheck:
     """Finds the infeasible samples of a joint motion (baseline M1).
 
-    A sample is infeasible if one of these conditions holds. A joint exceeds a position or velocity limit. The smallest
-    singular value of the tool's Jacobian is below 0.03. The arm is almost straight (:func:`stretch` above 79/80). An
-    additional constraint is violated.
+    A sample is infeasible if the arm can't execute it well, for one of four reasons: a joint exceeds a position or
+    velocity limit; the smallest singular value of the tool's Jacobian is below 0.03; the arm is almost straight
+    (:func:`stretch` above 79/80); or an additional constraint is violated.
 
     Args:
         arm: the robot's arm with its tool.

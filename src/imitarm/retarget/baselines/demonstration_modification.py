@@ -288,10 +288,10 @@ def pull(points: Array, joints: Array) -> Array:
     r"""Return the factor :math:`\kappa` by which the person's wrist must move closer to the shoulder, shape (n,).
 
     The function computes by how much the robot's elbow must bend further, until
-    :func:`~imitarm.retarget.baselines.demonstrated_motion.stretch` is at most 78/80. The factor is such that the
-    person's elbow bends by the same angle. In a relative mapping, the elbow angles of robot and person can differ. If
-    they are equal, :math:`\kappa = \frac{78}{80} L / |W - S|`, where W is the wrist, S the shoulder and L the length of
-    the straight arm.
+    :func:`~imitarm.retarget.baselines.demonstrated_motion.stretch` is at most 78/80. With the factor :math:`\kappa`,
+    the person's elbow bends by the same angle. In a relative mapping, the elbow angles of robot and person can differ.
+    If they are equal, :math:`\kappa = \frac{78}{80} L / |W - S|`, where W is the wrist, S the shoulder and L the length
+    of the straight arm.
 
     Args:
         points: shoulder, elbow, wrist, shape (n, 3, 3) [m].

@@ -190,7 +190,7 @@ class DelayedCurve:
         self, window: float = 0.6, lag: float = 0.07, *, smooth: bool = True, whole: HandCurve | None = None
     ) -> None:
         if not 0.2 <= window <= 5.0 or not 0.0 <= lag <= 0.5 * window:
-            raise InputError("DelayedCurve: window must be 0.2 to 5 s and lag at most half of it")
+            raise InputError("DelayedCurve: window must be 0.2 to 5 s, and lag must be 0 s to half of window")
         self._window, self._smooth, self._whole = window, smooth, whole
         self._lag = lag if whole is None else 0.0
         self._samples: deque[HandSample] = deque()
