@@ -359,7 +359,7 @@ def _best_yaw(local: Array, eye: Array, yaws: Array) -> float:
 
 
 def basis_across(axes: Array) -> tuple[Array, Array]:
-    """Return two unit vectors for each of ``axes`` (k, 3), perpendicular to the axis and to each other: two (k, 3).
+    """Return two unit vectors for each of ``axes`` (k, 3), perpendicular to it and to each other: two arrays (k, 3).
 
     The formula is from Duff et al., *Building an orthonormal basis, revisited*, JCGT 2017.
     """

@@ -1,10 +1,10 @@
 """Pairs of a sphere of the arm and an obstacle, or of two spheres of the arm, and the search for the near pairs.
 
-Spheres cover the arm. An arm has thousands of pairs, but at most points of a path only few pairs are near. Two bounds
-that take little time exclude most of the distant pairs. First, ``ArmPath.travel`` bounds how far the spheres of a link
-move between two postures. The distances are therefore measured at few postures of the path; at the postures in between,
-only the pairs that could be near are measured. Second, each obstacle is inside a bounding sphere. The distance to this
-sphere takes less time to compute than the distance to the obstacle.
+Spheres cover the arm. An arm has thousands of pairs, but usually only few of them are near each other at one point of a
+path. Two bounds that take little time exclude most of the distant pairs. First, ``ArmPath.travel`` bounds how far the
+spheres of a link move between two postures. The distances are therefore measured at few postures of the path; at the
+postures in between, only the pairs that could be near are measured. Second, each obstacle is inside a bounding sphere.
+The distance to this sphere takes less time to compute than the distance to the obstacle.
 """
 
 from __future__ import annotations

@@ -80,9 +80,9 @@ class CertifiedRCAMO(Policy):
     mean velocities over a longer time (:mod:`~imitarm.perception.steady_velocity`). If a new prediction of a tracked
     obstacle comes too close to a plan, the plan stays valid while its next 1.5 s keep the clearance.
 
-    The status of each command names the obstacle in its reason. As soon as a plan is certified, the motion continues.
-    As with all policies, let a :class:`~imitarm.safety.SafetyFilter` check every command. If obstacles at rest make the
-    motion impossible, ``reset`` raises an error. If only a moving obstacle makes the motion impossible, the arm waits.
+    The reason in each command names the obstacle. As soon as a plan is certified, the motion continues. As with all
+    policies, let a :class:`~imitarm.safety.SafetyFilter` check every command. If obstacles at rest make the motion
+    impossible, ``reset`` raises an error. If only a moving obstacle makes the motion impossible, the arm waits.
 
     In a simulation, the time stands still while ``step`` computes a plan. On a real arm, the computation takes time;
     set ``planning_time`` to this time. Each plan then begins at the end of this time, at the state that is predicted
@@ -101,8 +101,8 @@ class CertifiedRCAMO(Policy):
         pinned: see :func:`~imitarm.policies.adapt`.
         allowance: additional clearance for tracking errors [m]. If no plan has this additional clearance, the policy
             plans without it.
-        hold: time for which a plan must keep its clearances at the goal after the arrival, and a stop must keep them at
-            rest [s].
+        hold: time for which the clearances must be guaranteed at the goal after the arrival, and at rest after a stop
+            [s].
         gain: feedback gain of the joint positions [1/s].
         arrival: distance from the goal below which the tool has arrived [m].
         max_rounds: largest number of rounds of one search for a plan, which limits the computing time. The next search

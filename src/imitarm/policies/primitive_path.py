@@ -95,7 +95,7 @@ class PrimitivePath:
         return np.rint(np.minimum(np.maximum(phases, 0.0), 1.0) * N_SAMPLES).astype(np.intp)
 
     def tangent(self, phase: float) -> Array:
-        """Return the direction of the motion (3,), or of the goal where the motion rests; 0 at the goal."""
+        """Return the direction of the motion (3,), or towards the goal where the motion rests; 0 at the goal."""
         i = min(int(phase * N_SAMPLES), N_SAMPLES - 1)
         along = self._steps[i]
         length = float(np.sqrt(along.dot(along)))

@@ -125,7 +125,7 @@ def safe_rates(
         times: path parameter s of each sample, increasing, shape (n,) [s].
         clock: expected time of the arm at each sample, shape (n,) [s]; it determines the positions of moving obstacles.
         allowance: difference between the required clearance and the smaller clearance that the safety filter keeps [m].
-        tool_only: whether to consider only the distances of the last link and the tool from obstacles. These distances
+        tool_only: True: only the distances between obstacles and the last link (with the tool) count. These distances
             do not depend on the posture of the other links.
 
     Returns:

@@ -60,10 +60,10 @@ class EngagementRule:
 
     Attributes:
         seen_for: time for which the person's arm must be visible before the robot follows it.
-        follow_until: time since the arm was last seen at which FOLLOWING ends; shorter gaps between frames have no
+        follow_until: FOLLOWING ends when the arm has not been seen for this time; shorter gaps between frames have no
             effect.
-        coast_until: time since the arm was last seen at which COASTING ends.
-        hold_until: time since the arm was last seen at which HOLDING ends; inf: HOLDING does not end.
+        coast_until: COASTING ends when the arm has not been seen for this time.
+        hold_until: HOLDING ends when the arm has not been seen for this time; inf: HOLDING does not end.
     """
 
     seen_for: float = SEEN_FOR

@@ -34,8 +34,8 @@ class ElasticBand(BaselinePolicy):
 
     The start and the goal are fixed. The equilibrium minimises an energy:
     ``1/2 sum |d_(i+1) - d_i|^2 + k/2 sum max(d_0 - gap, 0)^2``.
-    Newton steps, which treat the normals as constant, find this minimum. The first band is a collision-free path, as in
-    the paper: the learned path, displaced around each obstacle to the side that needs the least jerk.
+    Newton steps, which treat the normals as constant, find this minimum. As in the paper, the first band is a
+    collision-free path. It is the learned path, displaced around each obstacle to the side that needs the least jerk.
 
     Args:
         skill: skill to reproduce.

@@ -5,8 +5,8 @@ result an independent optimiser reaches. The optimiser uses no part of the compa
 motion primitive and no potential.
 
 Let ``x_i`` be the nominal path and ``x_i + d_i`` the path to find, with ``i = 0..99``. The deviation ``d_i`` minimises
-the integral of its squared jerk, computed from third differences. The constraints limit the gap ``g_o`` to every
-obstacle ``o``::
+the integral of its squared jerk, computed from third differences. The constraints keep a gap ``g_o`` to every obstacle
+``o``::
 
     min  1 / dt^5 sum_i |d_(i+3) - 3 d_(i+2) + 3 d_(i+1) - d_i|^2
     s.t. g_o(x_i + d_i) >= clearance,   f . d_i <= 0 for every forbidden direction f,

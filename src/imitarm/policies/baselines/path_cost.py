@@ -106,7 +106,7 @@ class PathCost:
     def blocks(self, deviation: Array) -> Array:
         """Return the second derivatives of the features with respect to each single sample, shape (6, 94, k, k).
 
-        The entries of the feature "jerk" are set to 0. Its Hessian also couples different samples; it is ``2
+        The entries of the feature "jerk" are 0 here, because its Hessian couples different samples. This Hessian is ``2
         smoothness`` for each direction.
         """
         gap, normal = self._gaps(deviation)

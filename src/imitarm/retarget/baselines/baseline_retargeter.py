@@ -29,8 +29,8 @@ class BaselineRetargeter(Retargeter):
     """Base class of the baselines, with the same processing of the input as all other methods.
 
     :class:`~imitarm.retarget.retargeter.Retargeter` estimates the person's arm, and decides when the robot follows the
-    person. The publications of the baselines do not describe two points, which this class decides. While the camera
-    does not see the person, the robot holds its position. Joint positions are clipped to the ranges of the joints. A
+    person. This class also decides two points that the publications of the baselines leave open. While the camera does
+    not see the person, the robot holds its position. Joint positions are clipped to the ranges of the joints. A
     baseline may exceed velocity limits; ``notes`` counts how often.
 
     A subclass implements ``_wanted``.

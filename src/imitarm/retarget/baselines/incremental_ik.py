@@ -37,8 +37,8 @@ class IncrementalIK(BaselineRetargeter):
     tool's motion. In ``notes``, ``"capped_steps"`` is the number of control steps in which a velocity limit was active.
     ``"caps"`` is the number of limited joints, summed over these steps.
 
-    M3 does not include the movement primitives of the cited paper, because this library uses movement primitives in the
-    learned skill, with every retargeting method.
+    M3 does not include the movement primitives of the cited paper. In this library, movement primitives belong to the
+    learned skill, which is independent of the retargeting method.
 
     Args:
         arm: the robot's arm with its tool.
@@ -50,7 +50,7 @@ class IncrementalIK(BaselineRetargeter):
         gain: gain K, the fraction of the error that is corrected per frame.
 
     Raises:
-        InputError: when the gain is not above 0 and at most 1.
+        InputError: when the gain is 0, negative or above 1.
     """
 
     name: ClassVar[str] = "m3"
