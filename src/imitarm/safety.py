@@ -112,8 +112,8 @@ class SafetyFilter:
         margin: upper bound of the error of an obstacle's predicted position, as a function of the prediction time. The
             filter adds this bound to the clearance. The prediction time is the time since the obstacle was seen plus
             ``latency``. None: predictions count as exact.
-        deviations: number of standard deviations of an obstacle's position that are also added to the clearance, if the
-            obstacle has a covariance.
+        deviations: additional margin for obstacles with a covariance, as a number of standard deviations of the
+            position.
 
     Raises:
         InputError: when a number is out of range, or a clearance is required but ``method`` can't keep it.

@@ -90,7 +90,9 @@ def fit_motion(
     finite_number(scale, "scale", above=0.0)
     path = path[np.isfinite(path).all(axis=1)]
     if not len(path) or not np.isfinite(begin).all():
-        raise InputError("fit: the wrist was never seen, so nothing can be fitted")
+        raise InputError(
+            "fit: the wrist was never seen, so nothing can be fitted; check which arm the camera has recorded"
+        )
     middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
     outermost = path[np.unique(np.concatenate([path.argmin(axis=0), path.argmax(axis=0)]))] - middle
     search = _Search(arm, standard_fixtures() if fixtures is None else fixtures)

@@ -55,8 +55,8 @@ class ClearanceLimit:
         retreat_rate: smallest rate at which a negative h must grow, divided by the magnitude of h [1/s].
         delay: T, the control period plus the latency of the arm [s]. For each obstacle, the time since it was seen is
             added to T.
-        deviations: number of standard deviations of an obstacle's position along the normal to subtract from its
-            distance, if the obstacle has a covariance.
+        deviations: additional margin for obstacles with a covariance, as a number of standard deviations of the
+            position along the normal.
 
     Raises:
         InputError: when ``arm`` is not an ArmModel, or a number is not finite or is negative.

@@ -94,7 +94,7 @@ class Polytope:
         )
 
     def formula(self, q: Array, gradient: bool) -> tuple[Array, Array | None]:
-        """Return distances and normals, as the formula of a :class:`~imitarm.scene.obstacle.Family` does."""
+        """Compute the formula of a :class:`~imitarm.scene.obstacle.Family` for this hull: distances and normals."""
         distance, rows = self.distance_and_normal(np.ascontiguousarray(q.reshape(3, -1).T))
         return distance.reshape(q.shape[1:]), rows.T.reshape(q.shape) if gradient else None
 

@@ -94,7 +94,7 @@ class MovingScene:
             index = names.index(key) if key in names else key
             if not isinstance(index, int) or not 0 <= index < len(names):
                 known = ", ".join(repr(name) for name in names if name) or "none has a name"
-                raise InputError(f"MovingScene: no obstacle {key!r}; there are {len(names)} (names: {known})")
+                raise InputError(f"MovingScene: no obstacle {key!r}; the scene has {len(names)} (names: {known})")
             if not callable(motion):
                 raise InputError(
                     f"MovingScene: the motion of obstacle {key!r} must be a function of time, got {motion!r}"

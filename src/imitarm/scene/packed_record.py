@@ -1,4 +1,4 @@
-"""Conversion of packed obstacles to a C structure for compiled code, and back from the results of compiled code."""
+"""Conversion of packed obstacles to the C structure of compiled code, and from the results of compiled code."""
 
 from __future__ import annotations
 

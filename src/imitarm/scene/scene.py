@@ -229,7 +229,7 @@ class Scene:
         i = whole_number(index, "name_of: index")
         obstacles = self.__dict__.get("_seen", self).obstacles  # shapes and names do not depend on the time
         if not 0 <= i < len(obstacles):
-            raise InputError(f"obstacle {i} does not exist; the scene has {len(obstacles)}")
+            raise InputError(f"obstacle {i} does not exist; the scene has {len(obstacles)} obstacles")
         obstacle = obstacles[i]
         if obstacle.name:
             return f'{obstacle.kind} "{obstacle.name}"'

@@ -270,7 +270,7 @@ class DMP:
         Args:
             start: a Pose, or a position (3,) [m] with the learned start rotation; None: the learned start.
             goal: a Pose, or a position (3,) [m] with the learned goal rotation; None: the learned goal.
-            duration: duration of the motion [s]; None: the learned one.
+            duration: duration of the motion [s]; None: the learned duration.
             start_velocity: start velocity (3,) [m/s]; None: the learned start velocity, scaled with the duration.
             adjustment: name of the method that changes the motion for another start and goal; the class describes the
                 methods.

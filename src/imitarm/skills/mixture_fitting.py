@@ -353,8 +353,8 @@ def try_numbers_of_components(
     Args:
         tables: samples [t, x, y, z, ...] of each demonstration, over the same span of time.
         numbers: numbers K of components to try.
-        min_std: a column counts as constant if its standard deviation is at most this value; one value for each column,
-            in the column's unit.
+        min_std: one value for each column, in the column's unit. A column with at most this standard deviation counts
+            as constant.
         reg_covar: lower bound of the eigenvalues of a covariance, relative to the variances of the columns.
         more: further numbers to try in this order. The search ends when a fit has a bias of at most 1 % of the motion's
             extent and a learned path has at least 95 % of the motion's length.

@@ -144,7 +144,9 @@ class RhythmicDMP:
         if trajectory.quaternions is not None:
             self.reference_ = RotationReference.among([(t, trajectory.quaternions)])
             if len(self.reference_.times) > 1:
-                raise InputError("RhythmicDMP.fit: the motion rotates more than 120 degrees from its mean rotation")
+                raise InputError(
+                    "RhythmicDMP.fit: the motion must not rotate more than 120 degrees from its mean rotation"
+                )
             columns = np.column_stack([columns, self.reference_.to_vectors(t, trajectory.quaternions)])
         self.period_ = P
         spline, self._rate_at_start = self._responses()

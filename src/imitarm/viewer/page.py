@@ -225,7 +225,7 @@ def check_writable(path: str | Path) -> Path:
     if not target.parent.is_dir():
         raise InputError(f"report {target}: there is no folder {target.parent}; create it first")
     if not os.access(target.parent, os.W_OK):
-        raise InputError(f"report {target}: no permission to write to the folder; choose another one")
+        raise InputError(f"report {target}: no permission to write to the folder; choose another folder")
     return target
 
 
