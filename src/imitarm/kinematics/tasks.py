@@ -109,7 +109,7 @@ class PostureTask(NamedTuple):
 
     Attributes:
         q: joint positions :math:`q_{ref}` of the posture, shape (n_joints,) [rad].
-        gain: k [1/s].
+        gain: gain k of the speed [1/s].
         weight: weight of this task [m^2]; the weight of a twist is 1.
     """
 
@@ -150,7 +150,7 @@ class ElbowTask(NamedTuple):
         angle: desired SEW angle :math:`\psi_h` [rad].
         weight: weight w [m^2]; the tool's task has the weight 1.
         confidence: certainty c of the desired angle, 0 to 1; 0: the elbow is not moved.
-        gain: k [1/s].
+        gain: gain k of the speed [1/s].
         max_rate: limit of the desired rate of the angle [rad/s].
         convention: convention of the SEW angle, see :func:`~imitarm.kinematics.sew.sew_angle`.
     """

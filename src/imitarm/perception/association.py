@@ -58,7 +58,7 @@ def assigned(tracks: Tracks, detections: Sequence[Detection], measured: Measurem
 
     Args:
         tracks: the tracks, predicted to the time of the detections.
-        detections: m detections.
+        detections: the m detections.
         measured: the m detections as measurements.
         gate: largest normalised innovation squared of a pair, see :func:`assign`.
     """

@@ -27,8 +27,8 @@ class Consistency:
 
     Attributes:
         mean: mean of ``d^2``; nan if there are no values.
-        low: lower end of the band.
-        high: upper end of the band.
+        low: lower end of the band for ``mean``.
+        high: upper end of the band for ``mean``.
         count: number of values.
     """
 

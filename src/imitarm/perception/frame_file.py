@@ -79,7 +79,7 @@ class FrameRecording:
         Depths and points are rounded to single precision, and colours to 256 levels.
 
         Args:
-            path: file, with the ending ``.npz``.
+            path: path of the file, which must end in ``.npz``.
 
         Raises:
             InputError: when the path does not end in ``.npz``, or the file can't be written.

@@ -173,7 +173,7 @@ def grow(obstacle: Obstacle, visible: Visible, space: FreeSpace) -> tuple[Obstac
     """Extend the unseen faces or ends of a shape until they reach space that the camera saw to be empty.
 
     Args:
-        obstacle: a fitted shape.
+        obstacle: the fitted shape.
         visible: the points to which the shape was fitted.
         space: the space that the camera saw to be empty.
 

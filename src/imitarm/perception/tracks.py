@@ -297,7 +297,7 @@ class TrackedObstacle:
         """Return the obstacle ``horizon`` seconds later, without new detections; its uncertainty grows.
 
         Args:
-            horizon: time ahead [s].
+            horizon: time by which the obstacle is predicted [s].
 
         Raises:
             InputError: when the horizon is not a finite number.

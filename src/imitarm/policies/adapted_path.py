@@ -58,7 +58,7 @@ class Adaptation:
         feasible: whether ``certified_clearance`` is at least the required clearance, and the displacements and the
             steps of the path are within the method's limits.
         reason: text that says which obstacle blocks the path, and why it can't be avoided; empty if ``feasible``.
-        method: name of the method.
+        method: name of the adaptation method.
         compute_time: computing time of the whole adaptation [s].
         joints: joint positions along the path, shape (n, n_joints) [rad]; None when only the tool was planned. Between
             two samples the joints move linearly.

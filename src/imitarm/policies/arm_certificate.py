@@ -132,7 +132,7 @@ class ArmAmongObstacles:
         """Return the pairs (sphere and obstacle, or two spheres) that have less room than ``reach`` at each sample.
 
         Args:
-            path: the arm at n samples.
+            path: postures of the arm at n samples.
             times: time of each sample [s], shape (n,).
             reach: limit of the room, which is the distance minus the required clearance minus the margin [m].
             connected: True: the samples form a path; False: they are unrelated postures.
@@ -152,7 +152,7 @@ class ArmAmongObstacles:
         """Return the pairs whose distance may shrink faster than allowed during a motion.
 
         Args:
-            path: the arm at n samples.
+            path: postures of the arm at n samples.
             times: time of each sample [s], shape (n,).
             velocity: joint velocities, shape (n, n_joints) [rad/s].
             obstacles: limit of the rate at which distances to obstacles shrink.
@@ -169,7 +169,7 @@ class ArmAmongObstacles:
         """Return the smallest clearance at the samples of a path; the room of the result is at most ``reach``.
 
         Args:
-            path: the arm at n samples.
+            path: postures of the arm at n samples.
             times: time of each sample [s], shape (n,).
             reach: largest room that is searched for [m]. If every pair has more room, the result has this room.
         """
@@ -202,7 +202,7 @@ class ArmAmongObstacles:
         bound is high enough, and the method computes no tangents.
 
         Args:
-            path: the arm at n samples.
+            path: postures of the arm at n samples.
             times: time of each sample [s], shape (n,).
         """
         travels = [pairs.travel(path, times) for pairs in self._pairs]

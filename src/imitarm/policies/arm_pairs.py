@@ -72,7 +72,7 @@ class Pairs(ABC):
         """Return all pairs with less room than a limit at some samples, and perhaps others.
 
         Args:
-            path: the arm at n samples.
+            path: postures of the arm at n samples.
             times: time of each sample [s], shape (n,).
             samples: indices of k samples.
             limit: limit of each of these samples and each group, shape (k, n_groups) [m].
@@ -118,7 +118,7 @@ class Pairs(ABC):
         """Return upper bounds of the rate at which the distances of each group shrink, shape (n, n_groups) [m/s].
 
         Args:
-            path: the arm at n samples.
+            path: postures of the arm at n samples.
             velocity: joint velocities, shape (n, n_joints) [rad/s].
         """
         speeds = path.speeds(velocity)[:, self._of_groups[0], self._of_groups[1]]
@@ -128,7 +128,7 @@ class Pairs(ABC):
         """Return all pairs with less room (distance minus required clearance minus margin) than ``reach``.
 
         Args:
-            path: the arm at n samples.
+            path: postures of the arm at n samples.
             times: time of each sample [s], shape (n,).
             reach: limit of the room at each sample for each group, shape (n, n_groups) [m].
             travel: the result of :meth:`travel`; None if the samples do not form a path.
@@ -162,7 +162,7 @@ class Pairs(ABC):
         """Return the position, the room and the gradient of chosen pairs.
 
         Args:
-            path: the arm at n samples.
+            path: postures of the arm at n samples.
             sample: index of the sample of each pair, shape (k,).
             pair: index of the pair, shape (k,).
             times: time of each of the k samples [s].
@@ -319,7 +319,7 @@ class Gaps:
     """The near pairs at the samples of a path, each a sphere of the arm and an obstacle, or two spheres of the arm.
 
     Attributes:
-        path: the arm at the samples.
+        path: postures of the arm at the samples.
         times: time of each sample [s].
         sources: all pairs: one object for each obstacle and one for the links of the arm.
         source: index in ``sources`` of the object with each near pair, shape (k,).

@@ -154,7 +154,7 @@ class ToolAmongObstacles:
         """Return positions of the centre of a pair's sphere, relative to the obstacle's displacement since time 0.
 
         Args:
-            pair: index of the pair.
+            pair: index of the pair of a sphere and an obstacle.
             positions: positions of the tip, shape (..., m, 3) [m].
             samples: indices of the m samples of the path to which the positions belong.
 
@@ -181,7 +181,7 @@ class ToolAmongObstacles:
         """Return the margin of a pair's obstacle at points between samples; 0 if the obstacle has no margin.
 
         Args:
-            pair: index of the pair.
+            pair: index of the pair of a sphere and an obstacle.
             segment: index of the sample before each point, shape (m,).
             fraction: position of the point between this sample (0) and the next sample (1), shape (m,).
 
@@ -197,7 +197,7 @@ class ToolAmongObstacles:
         """Return the distance (...) [m] from a sphere's surface to the obstacle, and its gradient (..., 3).
 
         Args:
-            pair: index of the pair.
+            pair: index of the pair of a sphere and an obstacle.
             centres: results of :meth:`centres`, shape (..., 3) [m].
             margin: results of :meth:`margin` for the same points, broadcast to their shape (...) [m].
         """
@@ -222,7 +222,7 @@ class ToolAmongObstacles:
         and never passes it.
 
         Args:
-            pair: index of the pair.
+            pair: index of the pair of a sphere and an obstacle.
             points: positions of the centre of the pair's sphere, shape (p, 3) [m].
             directions: unit vectors, one for each row, shape (m, 3).
             target: distance between sphere and obstacle that the points must reach [m].
@@ -276,7 +276,7 @@ class PathClearance:
     """Distances from the tool to the obstacles along one path of the tip, and their lower bounds between the samples.
 
     Attributes:
-        tool: the spheres and the obstacles.
+        tool: the spheres of the tool, and the obstacles.
         positions: positions of the tip, shape (n, 3) [m].
         distance: distance of each pair at each sample, shape (n_pairs, n) [m].
         normal: gradients of the distances, shape (n_pairs, n, 3).

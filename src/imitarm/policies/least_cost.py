@@ -144,7 +144,7 @@ class LeastCost:
         discount: gamma, the factor by which the weight decreases from one time of the horizon to the next.
         deviation_weight: w_e, weight of the deviation [1/m^2].
         change_weight: w_Delta, weight of a change of u since the last step.
-        size_weight: w_u, weight of the size of u.
+        size_weight: w_u, weight of the squared norm of u.
         wait_weight: w_r, weight of the difference between r and the learned speed 1.
         rates: candidates for the speed r of the phase; the first is 1, the learned speed.
         sizes: candidates for the norm of u, as fractions of u_max.
@@ -245,7 +245,7 @@ class LeastCost:
             sizes: cost of the size of each candidate, shape (C,).
             previous: u / u_max of the last choice, shape (3,).
             free: deviations without coupling, shape (H, 3) [m].
-            precision: Theta, shape (3, 3).
+            precision: Theta at the current phase, shape (3, 3).
         """
         task, pull, curvature = self._task
         pulled = free.dot(precision)

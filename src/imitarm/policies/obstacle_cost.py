@@ -71,8 +71,8 @@ class ObstacleCost(ABC):
         In candidate c, the centre of the sphere of pair k is ``origins[k] + scales[k] moves[c]``.
 
         Args:
-            obstacles: n obstacles at H instants.
-            groups: k pairs.
+            obstacles: n obstacles, predicted for H times.
+            groups: k pairs of an obstacle and a sphere, each at one time.
             origins: centres of the spheres, shape (k, 3) [m].
             scales: factor of the candidates' ``moves`` for each pair, shape (k,) [m].
             moves: direction and relative size of each candidate's displacement, shape (C, 3).
@@ -97,8 +97,8 @@ class ObstacleCost(ABC):
         For a tool with several spheres, the largest of their costs counts.
 
         Args:
-            obstacles: n obstacles at H instants.
-            groups: k pairs.
+            obstacles: n obstacles, predicted for H times.
+            groups: k pairs of an obstacle and a sphere, each at one time.
             origins: see :meth:`gaps`.
             scales: see :meth:`gaps`.
             moves: see :meth:`gaps`.

@@ -227,7 +227,7 @@ def _followed(chain: Array, nominal: Array, longest: float) -> Array | None:
     Args:
         chain: corners of the polyline, shape (m, d) [m].
         nominal: nominal path, shape (n, d) [m].
-        longest: no step may be longer [m].
+        longest: largest length of a step [m].
 
     Returns:
         The points; None if the polyline is too long.

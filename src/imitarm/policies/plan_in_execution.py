@@ -45,7 +45,7 @@ class PlanInExecution:
     """A certified plan of the whole arm, in execution since the time ``began``.
 
     Attributes:
-        adaptation: the plan.
+        adaptation: the plan, as a result of ``adapt`` or ``replan``.
         began: time at which the execution of the plan began [s].
         offset: time in the learned motion that corresponds to the start of the plan [s].
         scene: the obstacles at the time ``seen``, for which the guarantee was computed.

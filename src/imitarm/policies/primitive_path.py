@@ -52,7 +52,7 @@ class PrimitivePath:
         """Return the motion between two poses.
 
         Args:
-            dmp: the primitive.
+            dmp: the motion primitive.
             precision: result of :func:`learned_precision`, shape (n + 1, 3, 3).
             start: pose of the tool at the start; None: the learned start.
             goal: pose of the tool at the end; None: the learned goal.

@@ -121,7 +121,7 @@ def safe_rates(
 
     Args:
         around: the arm, its obstacles and the required clearances.
-        path: the arm at n samples.
+        path: postures of the arm at n samples.
         times: path parameter s of each sample, increasing, shape (n,) [s].
         clock: expected time of the arm at each sample, shape (n,) [s]; it determines the positions of moving obstacles.
         allowance: difference between the required clearance and the smaller clearance that the safety filter keeps [m].

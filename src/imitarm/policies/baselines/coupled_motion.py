@@ -34,10 +34,10 @@ class MotionState(NamedTuple):
     Velocities are multiplied by the duration T, as in the equation of a motion primitive, and thus have the unit m.
 
     Attributes:
-        position: x, shape (3,) [m].
-        velocity: v = T x', shape (3,) [m].
+        position: position x of the tool, shape (3,) [m].
+        velocity: velocity of the tool times T, v = T x', shape (3,) [m].
         phase: phase s of the primitive, which decays from 1 at the start to 0.01 after the duration T.
-        fraction: time divided by the duration.
+        fraction: elapsed time divided by the duration T.
         learned: position of the nominal path at this time, shape (3,) [m].
         distance: the gap, or 5 mm if the gap is smaller, shape (n,) [m].
         reach: distance from the tool's tip to the closest point of each obstacle, or 5 mm if it is nearer, shape (n,)
@@ -227,7 +227,7 @@ class Surroundings:
         gaps: distances to the obstacles.
         packed: the obstacles at time 0.
         clearance: required clearance [m].
-        duration: T [s].
+        duration: duration T of the motion [s].
     """
 
     def __init__(self, gaps: ToolGaps, packed: PackedObstacles, clearance: float, duration: float) -> None:
@@ -239,7 +239,7 @@ class Surroundings:
 
         Args:
             z: [x; T x'], the position and the velocity times the duration T, shape (2, 3) [m].
-            fraction: time divided by the duration.
+            fraction: elapsed time divided by the duration T.
             learned: position of the nominal path at this time, shape (3,) [m].
             time: time since the stamp of the scene, for the positions of moving obstacles [s]; None: time since the
                 motion began.

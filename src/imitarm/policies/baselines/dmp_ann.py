@@ -155,7 +155,7 @@ class Weights(NamedTuple):
     """A trained network, and a record of its training.
 
     Attributes:
-        network: the network.
+        network: the trained network.
         provenance: record of the training: command, seed, version of the code, numbers of scenes, validation loss,
             chosen gain and training time.
     """

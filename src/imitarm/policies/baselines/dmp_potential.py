@@ -23,8 +23,8 @@ def dynamic_potential(velocity: Array, normal: Array, distance: Array, gain: flo
         normal: n, unit vector from the closest point of each obstacle to the tool, shape (n, 3); theta is the angle
             between v and n.
         distance: p, distance of the tool to each obstacle, above 0, shape (n,) [m].
-        gain: lambda.
-        exponent: beta.
+        gain: lambda, the factor of the potential [m^2].
+        exponent: beta, the exponent of the cosine.
     """
     speed = np.sqrt(np.einsum("nd,nd->n", velocity, velocity))
     cosine = np.einsum("nd,nd->n", velocity, normal) / np.maximum(speed, 1e-12)
@@ -44,8 +44,8 @@ def dynamic_force(velocity: Array, normal: Array, distance: Array, reach: Array,
         normal: n, as for :func:`dynamic_potential`, shape (n, 3).
         distance: p, distance of the tool to each obstacle, above 0, shape (n,) [m].
         reach: distance from the tool's tip to the closest point, above 0, shape (n,) [m].
-        gain: lambda.
-        exponent: beta.
+        gain: lambda, the factor of the potential [m^2].
+        exponent: beta, the exponent of the cosine.
     """
     speed = np.maximum(np.sqrt(np.einsum("nd,nd->n", velocity, velocity)), 1e-12)
     cosine = np.einsum("nd,nd->n", velocity, normal) / speed
@@ -77,7 +77,7 @@ class DMPPotential(CoupledMotion):
 
     Args:
         skill: skill to reproduce.
-        gain: lambda, the factor of the potential [m].
+        gain: lambda, the factor of the potential [m^2].
         exponent: beta, the exponent of the cosine, at least 1.
         options: arguments of :class:`~imitarm.policies.baselines.coupled_motion.CoupledMotion`.
     """
@@ -86,7 +86,7 @@ class DMPPotential(CoupledMotion):
 
     def __init__(self, skill: Skill, *, gain: float = 0.1, exponent: float = 2.0, **options: Any) -> None:
         super().__init__(skill, **options)
-        self.gain = finite_number(gain, "DMPPotential: gain", "m", at_least=0.0)
+        self.gain = finite_number(gain, "DMPPotential: gain", "m^2", at_least=0.0)
         self.exponent = finite_number(exponent, "DMPPotential: exponent", at_least=1.0)
 
     def term(self, state: MotionState) -> Array:

@@ -24,8 +24,8 @@ def steering_rate(angle: Array, gain: float, decay: float) -> Array:
 
     Args:
         angle: theta, angle between the velocity and the direction to the obstacle [rad].
-        gain: gamma.
-        decay: beta [1/rad].
+        gain: gamma, the factor of the rate.
+        decay: beta, the decay of the rate with the angle [1/rad].
     """
     return np.asarray(gain * angle * np.exp(-decay * angle))
 
@@ -50,9 +50,9 @@ class DMPSteering(CoupledMotion):
 
     Args:
         skill: skill to reproduce.
-        gain: gamma.
-        decay: beta [1/rad].
-        distance_decay: kappa [1/m].
+        gain: gamma, the factor of the rate.
+        decay: beta, the decay of the rate with the angle [1/rad].
+        distance_decay: kappa, the decay of the rate with the distance [1/m].
         options: arguments of :class:`~imitarm.policies.baselines.coupled_motion.CoupledMotion`.
     """
 

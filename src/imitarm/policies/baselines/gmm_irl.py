@@ -123,7 +123,7 @@ class Weighted(NamedTuple):
 
     Attributes:
         skill: the skill, for the covariances of the demonstrations.
-        weights: weight of each feature.
+        weights: weight of each feature in ``path_cost.FEATURES``.
         margin: distance that is subtracted from each gap [m].
         axes: orthonormal basis of the allowed directions, as columns, shape (3, k).
         one_sided: directions in which the path must not be displaced, in the basis ``axes``, shape (m, k).

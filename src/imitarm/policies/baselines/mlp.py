@@ -21,8 +21,8 @@ class MLP:
     """A multilayer perceptron with the layers ``x_(i+1) = tanh(x_i W_i + b_i)``; the last layer has no tanh.
 
     Attributes:
-        weights: W_i, each of shape (inputs, outputs).
-        biases: b_i, each of shape (outputs,).
+        weights: matrices W_i of the layers, each of shape (inputs, outputs).
+        biases: vectors b_i of the layers, each of shape (outputs,).
     """
 
     weights: tuple[Array, ...]
@@ -51,7 +51,7 @@ class MLP:
         """Return the derivatives of a loss with respect to all weights and biases.
 
         Args:
-            x: inputs, shape (n, m).
+            x: inputs of n samples, shape (n, m).
             slope: function that gets the outputs (n, k) and returns the derivatives of the loss with respect to the
                 outputs, shape (n, k).
 

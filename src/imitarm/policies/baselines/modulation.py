@@ -42,7 +42,7 @@ def modulated(desired: Array, around: NearObstacles, *, reactivity: float = 1.0,
 
     Args:
         desired: desired velocity u, shape (d,) [m/s].
-        around: the obstacles.
+        around: the obstacles near the tool.
         reactivity: with a larger value, an obstacle acts from farther away.
         reach: factor of the obstacles' sizes; with a larger value, an obstacle acts from farther away.
 

@@ -94,7 +94,7 @@ def push_components(
         path: the nominal path and its components.
         obstacles: obstacles with signed distance and gradient.
         margin: radius of the tool's sphere plus the required clearance [m].
-        method: ``"literal"`` or ``"mapf"``.
+        method: name of the potential, ``"literal"`` or ``"mapf"``.
         forbidden: directions in which no mean may move, unit vectors, shape (m, 3).
 
     Returns:

@@ -26,9 +26,9 @@ def attractive_potential(position: Array, goal: Array, stiffness: float, cap: fl
     """Return the attractive potential U_a (Eq 2.15, with the limit ``rho_c``).
 
     Args:
-        position: x, shape (3,) [m].
-        goal: g, shape (3,) [m].
-        stiffness: eta.
+        position: position x, shape (3,) [m].
+        goal: goal g, shape (3,) [m].
+        stiffness: factor eta of the attraction.
         cap: rho_c, the distance beyond which the attraction is constant [m].
     """
     rho = float(np.linalg.norm(position - goal))
@@ -50,7 +50,7 @@ def repulsive_potential(distance: Array, gain: float, influence: float) -> float
 
     Args:
         distance: d, distance to the closest point of each obstacle, negative inside, shape (n,) [m].
-        gain: k.
+        gain: factor k of the repulsion.
         influence: d_0, the distance beyond which an obstacle does not repel [m].
     """
     d = np.clip(distance, DISTANCE_FLOOR, influence)
@@ -63,10 +63,10 @@ def repulsive_force(distance: Array, normal: Array, gain: float, influence: floa
     """Return the sum of the repulsive forces F_r of all obstacles, shape (3,) (Eqs 2.19 and 2.22).
 
     Args:
-        distance: d, shape (n,) [m].
-        normal: n, the gradients of the distances, shape (n, 3).
-        gain: k.
-        influence: d_0 [m].
+        distance: distance d to each obstacle, shape (n,) [m].
+        normal: gradients n of the distances, shape (n, 3).
+        gain: factor k of the repulsion.
+        influence: d_0, the distance beyond which an obstacle does not repel [m].
     """
     d = np.clip(distance, DISTANCE_FLOOR, influence)
     return np.asarray((gain * (1.0 / d - 1.0 / influence) / d**2) @ normal)

@@ -105,7 +105,7 @@ class VelocityField(BaselinePolicy):
 
         Args:
             desired: desired velocity in the allowed directions, shape (d,) [m/s].
-            around: the obstacles.
+            around: the obstacles near the tool.
             limits: largest velocity in each direction ``self.one_sided``, shape (m,) [m/s]. The caller reduces a result
                 that exceeds a limit.
         """
@@ -140,7 +140,7 @@ class VelocityField(BaselinePolicy):
         """Return the position of the tool and the phase after one step.
 
         Args:
-            x: position before, shape (3,) [m].
+            x: position of the tool before the step, shape (3,) [m].
             phase: index of the point among the samples of the learned path, not rounded.
             follow: the learned path, the length of the step in samples of the path and in seconds, and the largest
                 speed [m/s].
