@@ -143,8 +143,7 @@ class Person:
             time: time at which tremor and sway are evaluated [s].
             wrist: desired position of the wrist in the sensor's frame, shape (3,) [m]; if the position is out of
                 reach, the arm stretches towards it.
-            swivel: angle psi of the elbow [rad]; None: this person's usual angle, computed from :attr:`swivel` and
-                :attr:`lift`.
+            swivel: angle psi of the elbow [rad]; None: the person's usual angle at this height of the wrist.
             hand: rotation of the hand in the sensor's frame, shape (3, 3), with x along the hand and y towards the
                 thumb; None: in line with the forearm, and with the thumb up when the forearm points forward.
             closed: whether the hand is a fist.

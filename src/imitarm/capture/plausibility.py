@@ -70,7 +70,7 @@ def length_unit_that_fits(limb: float) -> str | None:
     """Return the unit of length in which a limb has a plausible length; None when no unit fits.
 
     Args:
-        limb: length of an upper arm or a forearm in the file's unknown unit; a number that is implausible in metres.
+        limb: length of an upper arm or a forearm, as a number in the unknown unit of the file.
     """
     low, high = PLAUSIBLE_LIMB
     fits = [name for name, unit in _LENGTH_UNITS.items() if low <= limb * unit <= high]
@@ -84,8 +84,8 @@ def axes_that_fit(positions: Array) -> tuple[str, str] | None:
     """Return a description of the fault and the axes to use, for positions (n, 25, 3); None when the axes are correct.
 
     The axes are correct when the spine points up (y) and the trunk is in front of the sensor (z above 0). If several
-    choices of axes satisfy these conditions, the function proposes axes in which the person also faces the sensor, so
-    that the right shoulder has a larger x than the left shoulder. Right-handed axes are preferred to left-handed axes.
+    choices of axes satisfy these conditions, the function prefers axes in which the person faces the sensor. In these
+    axes, the right shoulder has a larger x than the left shoulder. Right-handed axes are preferred to left-handed axes.
     """
     spine = _median(_mean(positions[:, _UPPER]) - _mean(positions[:, _LOWER]))
     trunk = _median(_mean(positions[:, _TRUNK]))

@@ -38,7 +38,7 @@ class SkeletonRecording(SkeletonSource):
 
     A recording is also a source that replays its skeletons.
 
-    Skeletons are neither checked nor changed: times may decrease, and there may be several persons.
+    The constructor does not check the skeletons: their times may decrease, and they may show several persons.
     :func:`~imitarm.capture.checks.check` lists the faults.
 
     Args:
@@ -136,7 +136,7 @@ class SkeletonRecording(SkeletonSource):
         return self.with_skeletons(kept)
 
     def with_skeletons(self, skeletons: Iterable[Skeleton]) -> SkeletonRecording:
-        """Return a recording with the given skeletons, and with the name and the time unit of this recording."""
+        """Return a recording with the given skeletons; name, issues and time unit are those of this recording."""
         return SkeletonRecording(
             skeletons, name=self.name, realtime=self._realtime, issues=self.issues, time_unit=self.time_unit
         )
@@ -208,7 +208,7 @@ def read_recording(path: str | Path, *, realtime: bool = False) -> SkeletonRecor
     part = path.with_name(path.name + PART)
     if not path.exists() and part.exists():
         raise InputError(
-            f"{path}: does not exist, but {part} does; it was left by a recording that was not closed: read that file"
+            f"{path}: this file does not exist; read {part} instead, which a recording left that was not closed"
         )
     content = read_bytes(path)
     head = content[:65536]

@@ -40,10 +40,10 @@ _MAD_TO_SIGMA = 1.4826
 class SensorNoise:
     r"""Noise of a skeleton camera, estimated from its skeletons alone.
 
-    White noise is estimated from fifth-order differences over successive frames, in which a person's motion nearly
-    vanishes. Noise of standard deviation :math:`\sigma` gives differences of standard deviation
-    :math:`\sqrt{252}\,\sigma`. The estimate uses the median of the absolute differences, so that single jumps have
-    little effect. Slow errors are not part of the white noise, but they change the bone lengths.
+    White noise is estimated from fifth-order differences of the positions in successive frames. A person's motion
+    nearly vanishes in these differences. Noise of standard deviation :math:`\sigma` gives differences of standard
+    deviation :math:`\sqrt{252}\,\sigma`. The estimate uses the median of the absolute differences, so that single jumps
+    have little effect. Slow errors are not part of the white noise, but they change the bone lengths.
 
     Attributes:
         n_frames: number of skeletons.
@@ -239,7 +239,7 @@ def wrist_difference(one: SkeletonRecording, other: SkeletonRecording) -> float:
 def _describe(recording: SkeletonRecording, images: int, seconds: float, swaps: int) -> str:
     lines = [
         f"{recording.name}: {images} images, {len(recording)} with a person, {images / seconds:.0f} images per second, "
-        f"left and right swapped back in {swaps} images"
+        f"swapped left and right corrected in {swaps} images"
     ]
     noise = measure_noise(recording.skeletons).in_motion if len(recording) >= _LEAST_COMMON else None
     for side in SIDES:

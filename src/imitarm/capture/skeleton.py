@@ -56,7 +56,10 @@ ARM_JOINTS = {side: np.array([JOINT[f"{part}_{side}"] for part in _ARM_PARTS]) f
 
 
 class Tracking(IntEnum):
-    """Whether a camera tracks a joint, infers its position, or has lost it; numbered as in the Kinect SDK."""
+    """Whether a camera tracks a joint, infers its position, or has lost it.
+
+    The numbers are those of the Kinect SDK.
+    """
 
     LOST = 0
     INFERRED = 1
@@ -89,7 +92,7 @@ class Arm:
         time: time of the exposure, on the source's clock [s].
         points: positions of shoulder, elbow, wrist, hand, hand tip, thumb, shape (6, 3) [m]; nan where lost.
         confidence: confidence of each point, 0 (lost) to 1 (tracked), shape (6,).
-        hand_state: open, closed, or unknown.
+        hand_state: state of the hand, for example open or closed.
     """
 
     time: float
@@ -114,7 +117,7 @@ class Arm:
 
     @property
     def seen(self) -> bool:
-        """Whether shoulder, elbow and wrist all have a position."""
+        """Whether shoulder, elbow and wrist are each tracked or inferred, not lost."""
         return min(self.confidence.tolist()[:3]) > 0.0
 
 

@@ -97,7 +97,7 @@ class UdpSource(SkeletonSource):
     """Live skeletons from a :class:`SkeletonSender`.
 
     A :class:`~imitarm.transmission.datagram_filter.DatagramFilter` drops and counts datagrams that are late, damaged,
-    hostile, or from another sender. A sender that is killed and started again is accepted after half a second of
+    invalid, or from another sender. A sender that is killed and started again is accepted after half a second of
     silence. The time stamps of a restarted sender are shifted so that they keep increasing after the restart. While the
     sender is silent, every retargeter stops its robot. When skeletons arrive again, the robot follows the person again.
 
@@ -157,7 +157,7 @@ class UdpSource(SkeletonSource):
             pass
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton; None when none arrived within ``timeout`` seconds, or the source was closed."""
+        """Return the next skeleton; None if none arrives within ``timeout`` seconds, or if the source was closed."""
         until = clock.monotonic() + timeout
         while not self._closed:
             for data, address in waiting(self._socket):

@@ -58,7 +58,7 @@ examples:
   imitarm benchmark moving --count 100 --out moving
   imitarm benchmark moving compare moving --report moving.html
 
-'mapping' saves each result in the folder --out, and 'placements' in the file --out.
+'mapping' saves its results in the folder named by --out, and 'placements' in the file named by --out.
 If you interrupt one of these two commands, the same command later continues where it stopped.
 """
 
@@ -306,7 +306,7 @@ def _add_repeated(parsers: Any, name: str, task: RepeatedTask) -> None:
         type=Path,
         default=Path(f"benchmark-{name}"),
         metavar="FOLDER",
-        help=f"folder for the results, in which an interrupted run continues; default: benchmark-{name}",
+        help=f"folder for the results; an interrupted command continues there; default: benchmark-{name}",
     )
     add_workers(parser)
     add_fill(parser)

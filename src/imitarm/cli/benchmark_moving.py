@@ -99,8 +99,8 @@ def experiments_of(arguments: argparse.Namespace) -> list[MovingExperiment]:
     """Return the experiments that the options describe; experiments in the same scene follow one another.
 
     Raises:
-        InputError: when an option is out of range, or M10 (scenes from recorded motions) is named and the recordings
-            are missing.
+        InputError: when an option is out of range, or when the recordings for the family M10 (scenes from recorded
+            motions) are missing.
     """
     if arguments.count < 1 or arguments.first < 0:
         raise InputError(

@@ -62,7 +62,8 @@ class Finished(Generic[Outcome]):
         ran = len(self.outcomes) - self.kept
         speed = 60.0 * ran / self.seconds
         return (
-            f"{ran} experiments in {self.seconds:.0f} s: {speed:.0f} per minute; {self.kept} results were saved before"
+            f"{ran} experiments in {self.seconds:.0f} s: {speed:.0f} per minute; "
+            f"{self.kept} results of earlier runs were used"
         )
 
 

@@ -249,7 +249,10 @@ def _run(arguments: argparse.Namespace) -> int:
     for row in results.rows:
         slope, error, n = cost_law(results, row)
         if row.split(",")[0] == OURS and n > 2:
-            say(f"{row}: processor time grows as obstacles^{slope:.2f}, standard error of the exponent {error:.2f}")
+            say(
+                f"{row}: processor time grows with the number of obstacles to the power {slope:.2f} (standard error "
+                f"{error:.2f})"
+            )
     say(f"compare the methods: imitarm benchmark static compare {arguments.out}")
     return 0
 

@@ -58,8 +58,8 @@ _STILL = 0.015  # [m] largest standard deviation of a hand that is held still, w
 _SEEN = 0.5  # least fraction of frames with the hand
 _LEAST_FRAMES = 5
 _STEPS = (
-    "1. Stand 1.5 to 3 m in front of the sensor, facing it, alone in view.",
-    "2. Hold the {side} arm away from the body with a bent elbow, and keep the view from sensor to arm free.",
+    "1. Stand 1.5 to 3 m in front of the sensor and face it. No other person may be in view.",
+    "2. Hold the {side} arm away from the body with a bent elbow, and let nothing hide the arm from the sensor.",
     "3. Move the arm slowly during the measurement.",
 )
 
@@ -258,9 +258,8 @@ def _clutch(arguments: argparse.Namespace, before: Calibration) -> Calibration:
             anchor = choose("How far should the tool move when the hand moves?", _ANCHORS)
         if anchor == "shoulder" and before.lengths is None:
             raise InputError(
-                f"{arguments.out}: to match your whole reach to the robot's, the scale needs the lengths of your "
-                f"arm; run 'imitarm calibrate limbs "
-                "SOURCE' first, or give --scale"
+                f"{arguments.out}: to match your reach to the robot's reach, 'shoulder' needs the lengths of your arm; "
+                "run 'imitarm calibrate limbs SOURCE' first, or give --scale"
             )
         scale = 1.0
         if before.lengths is not None:

@@ -132,8 +132,8 @@ class CameraObserver:
         time = finite_number(time, "CameraObserver: time", "s")
         if time < self._now:
             raise InputError(
-                f"CameraObserver: time {time:g} s is earlier than in the last call ({self._now:g} s), but no image "
-                "shows the past. Call reset() before a new run"
+                f"CameraObserver: time {time:g} s is earlier than in the last call ({self._now:g} s), but times must "
+                "not decrease. Call reset() before a new run"
             )
         self._now = time
         if self._joints is not None:

@@ -22,7 +22,7 @@ class Contact(NamedTuple):
     """A contact that the torques of the joints show.
 
     Attributes:
-        joint: name of the joint whose external torque is largest in relation to the joint's threshold.
+        joint: name of the joint with the largest ratio of external torque to threshold.
         torque: external torque on this joint [N m].
         threshold: largest torque that does not count as a contact [N m].
         time: time on the robot's clock [s].

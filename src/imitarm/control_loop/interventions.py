@@ -9,7 +9,7 @@ from imitarm.safety import SafetyStep
 
 @dataclass(frozen=True)
 class Intervention:
-    """All control steps in which the safety filter changed the command to keep the same two parts apart.
+    """Summary of the control steps in which the safety filter changed the command to keep the same two parts apart.
 
     Attributes:
         link: name of the part of the arm.

@@ -60,7 +60,7 @@ class SensorModel:
     which lasts 0.5 s, an obstacle is missed in all frames. Every obstacle has one occlusion in each interval of ``1 /
     occlusions`` seconds, at a random time.
 
-    All random numbers follow from the seed, the frame's number k and the obstacle's index. Repeated requests for one
+    The seed, the frame's number k and the obstacle's index determine all random numbers. Repeated requests for one
     frame therefore return the same measurements.
 
     Attributes:

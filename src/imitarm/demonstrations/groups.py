@@ -95,7 +95,7 @@ def aligned_paths(trajectories: Sequence[Trajectory]) -> tuple[Array, Array | No
 
 
 def largest_distances(paths: Array) -> Array:
-    """Return for each pair of paths (m, n, 3) the largest distance between them at equal times, shape (m, m)."""
+    """Return the largest distance between each pair of paths (m, n, 3) at equal times, shape (m, m) [m]."""
     return np.stack([np.linalg.norm(paths - path, axis=2).max(axis=1) for path in paths])
 
 
@@ -105,8 +105,8 @@ def two_groups(
     """Divide m demonstrations into two groups by their distances (m, m); return None when there is only one group.
 
     The gap between the two groups is the longest edge of the minimum spanning tree of the demonstrations. There are two
-    groups only if the gap exceeds ``floor`` and is more than ``ratio`` times as long as the second longest edge, which
-    means that demonstrations within a group are much closer together than the groups.
+    groups only if the gap exceeds ``floor`` and is more than ``ratio`` times as long as the second longest edge.
+    Demonstrations within a group are then much closer together than the groups.
 
     Args:
         distance: distances between the demonstrations, shape (m, m).

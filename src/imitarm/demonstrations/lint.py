@@ -69,7 +69,7 @@ _ON_PATH = 0.35  # an incomplete motion ends this much nearer to the path of ano
 
 
 def lint(demonstrations: Sequence[Demonstration | RawDemonstration], *, arm: ArmModel | None = None) -> list[Finding]:
-    """Check each demonstration by itself and against the arm, and compare all with each other.
+    """Check each demonstration by itself and against the arm, and compare the demonstrations with each other.
 
     Args:
         demonstrations: demonstrations of one motion. Raw demonstrations (from ``read_raw``) may contain invalid
@@ -120,7 +120,8 @@ def check_gaps(motion: ValidRows) -> Iterator[Finding]:
         moved = float(np.linalg.norm(motion.positions[longest + 1] - motion.positions[longest]))
         count = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps, the longest"
         message = (
-            f"{count} of {steps[longest]:.3g} s (the usual step is {np.median(steps):.3g} s), in which the tool moved "
+            f"{count} of {steps[longest]:.3g} s (the usual time between samples is {np.median(steps):.3g} s), in which "
+            "the tool moved "
             f"{1e3 * moved:.0f} mm"
         )
         remedy = "record again, or accept that a straight line replaces the motion in the gap"

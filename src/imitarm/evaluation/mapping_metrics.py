@@ -92,7 +92,8 @@ class MappingMetrics:
             smoother.
         least_singular: smallest singular value of the tool's Jacobian during the motion, with 1 rad counted as 0.3
             m [m/rad].
-        teaching_time: time that a teacher needs for the corrections of the method [s]; 0 for methods without a teacher.
+        teaching_time: assumed working time of a teacher, for a method in which a teacher corrects the motion [s]; 0 for
+            other methods.
         failures: number of faults that the method detected in its motion but could not fix; 0 for methods that detect
             none.
     """
