@@ -130,7 +130,7 @@ def test_an_mjcf_says_its_limits_in_custom_numerics_and_actuators(write):
     assert arm.max_torque.tolist() == [14, 9]
     assert arm.upper.tolist() == [2, np.inf]
     wrong = mjcf('<numeric name="max_velocity" data="3 4 5"/>')
-    with pytest.raises(FileFormatError, match="'max_velocity' needs 2 positive values"):
+    with pytest.raises(FileFormatError, match="'max_velocity'> needs 2 positive values"):
         ArmModel.load(write(wrong, "wrong.xml"))
 
 

@@ -207,9 +207,7 @@ def read_recording(path: str | Path, *, realtime: bool = False) -> SkeletonRecor
     path = Path(path)
     part = path.with_name(path.name + PART)
     if not path.exists() and part.exists():
-        raise InputError(
-            f"{path}: this file does not exist; read {part} instead, which a recording left that was not closed"
-        )
+        raise InputError(f"{path}: this file does not exist; read {part} instead, which an interrupted recording left")
     content = read_bytes(path)
     head = content[:65536]
     unit = 1.0
@@ -240,8 +238,8 @@ class SkeletonRecorder:
         n_frames: number of frames written so far.
 
     Raises:
-        InputError: when the file exists and may not be replaced, when ``PATH.part`` exists because another recorder is
-            writing it or was killed, or when the file can't be written.
+        InputError: when the file exists and may not be replaced, or when it can't be written. Also when ``PATH.part``
+            exists, because another recorder is writing this file or was killed.
     """
 
     def __init__(self, path: str | Path, *, source: str = "", replace: bool = False) -> None:

@@ -164,7 +164,7 @@ def _add_placements(parsers: Any) -> None:
         metavar="FILE",
         help="skill files; default: the skill 'sweep' of the package, with the brush as default tool",
     )
-    placed.add_argument("--robots", nargs="+", metavar="NAME", help="use several arms; replaces --robot")
+    placed.add_argument("--robots", nargs="+", metavar="NAME", help="names of several arms, instead of --robot")
     placed.add_argument("--policies", nargs="+", choices=POLICIES, default=["acfra"], metavar="NAME")
     placed.add_argument("--seeds", type=int, default=50, metavar="N", help="number of placements; default: 50")
     placed.add_argument("--first", type=int, default=2000, metavar="N", help="first seed; default: 2000")

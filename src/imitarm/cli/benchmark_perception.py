@@ -33,7 +33,7 @@ def add_perception(parsers: Any) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     """Evaluate the scenes and print the tables."""
     if arguments.count < 1 or not 0 <= arguments.first <= MOST - arguments.count:
-        raise InputError(f"--count must be at least 1, and --first from 0 to {MOST} minus --count")
+        raise InputError(f"--count must be at least 1, --first at least 0, and their sum at most {MOST}")
     if not 24 <= arguments.height <= 1080:
         raise InputError(f"--height must be from 24 to 1080, got {arguments.height}")
     place = place_of(arguments, "perception")

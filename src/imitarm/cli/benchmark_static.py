@@ -101,7 +101,9 @@ def add_static(parsers: Any) -> None:
     tuning.add_argument("--save", type=Path, metavar="FILE", help="file of the best options; default: DIR/tuned.json")
     _add_running(tuning)
     tuning.set_defaults(benchmark=_tune)
-    scaling = actions.add_parser("scaling", help="vary the number of obstacles (1 to 20) and of tool spheres (1 to 16)")
+    scaling = actions.add_parser(
+        "scaling", help="measure time and success for 1 to 20 obstacles and for 1 to 16 tool spheres"
+    )
     scaling.add_argument("--methods", nargs="+", default=[OURS], metavar="NAME", help=f"default: {OURS}")
     scaling.add_argument(
         "--count",

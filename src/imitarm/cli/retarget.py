@@ -1,4 +1,4 @@
-"""``imitarm retarget``: convert a person's motion to a robot's, save it as a demonstration, write a report."""
+"""``imitarm retarget``: convert a person's motion to a robot motion, save it as a demonstration, and write a report."""
 
 from __future__ import annotations
 

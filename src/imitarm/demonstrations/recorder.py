@@ -35,8 +35,8 @@ class DemonstrationRecorder:
         n_samples: number of samples written so far.
 
     Raises:
-        InputError: when the file exists and may not be replaced, when ``PATH.part`` exists (an earlier recorder left
-            it, or another program is writing it), or when the file can't be written.
+        InputError: when the file exists and may not be replaced, or when it can't be written. Also when ``PATH.part``
+            exists, because another program is writing this file or was killed.
     """
 
     def __init__(

@@ -63,7 +63,7 @@ def person_means(values: Values) -> Array:
 
 
 def interval(values: Values, *, confidence: float = 0.95, seed: int = 0) -> Interval:
-    """Return the mean over persons and its bootstrap interval.
+    """Return the mean over persons and its bootstrap confidence interval.
 
     Args:
         values: values of each recording.
@@ -92,7 +92,7 @@ def bootstrap(samples: ArrayLike, *, confidence: float = 0.95, seed: int = 0) ->
         seed: seed of the resampling.
 
     Returns:
-        low and high; nan with fewer than two samples.
+        Lower and upper end of the interval; nan with fewer than two samples.
     """
     x = np.asarray(samples, dtype=float)
     n = len(x)
@@ -120,7 +120,7 @@ def block_bootstrap(
         seed: seed of the resampling.
 
     Returns:
-        low and high; nan with fewer than two blocks.
+        Lower and upper end of the interval; nan with fewer than two blocks.
     """
     x, t = np.asarray(values, dtype=float), np.asarray(times, dtype=float)
     if not len(x):
@@ -151,7 +151,8 @@ def median_ratio(
         seed: seed of the resampling.
 
     Returns:
-        ratio, low and high; low and high are nan with fewer than two cases, and all are nan without cases.
+        Ratio, lower end and upper end of its interval. With one case, both ends are nan; without cases, all three
+        values are nan.
     """
     x = np.stack([np.asarray(ours, dtype=float), np.asarray(theirs, dtype=float)])
     n = x.shape[1]

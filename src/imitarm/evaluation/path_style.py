@@ -44,7 +44,7 @@ def path_style(executed: Trajectory, learned: Trajectory, covariances: Array) ->
 
     Args:
         executed: path of the tool, with rotations.
-        learned: mean of the demonstrations, with rotations, n samples.
+        learned: mean of the demonstrations: a trajectory of n samples with rotations.
         covariances: covariance of the demonstrated positions at each sample of ``learned``, shape (n, 3, 3) [m^2].
 
     Raises:

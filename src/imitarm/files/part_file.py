@@ -29,8 +29,8 @@ class PartFile:
         part: path of the file until it is finished.
 
     Raises:
-        InputError: when the path is a folder, when the file exists and may not be replaced, when ``PATH.part`` exists
-            (an earlier program left it, or another program is writing it), or when the file can't be written.
+        InputError: when the path is a folder, when the file exists and may not be replaced, or when it can't be
+            written. Also when ``PATH.part`` exists, because another program is writing this file or was killed.
     """
 
     def __init__(self, path: str | Path, begin: str, *, replace: bool = False) -> None:

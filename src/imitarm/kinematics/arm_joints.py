@@ -275,7 +275,9 @@ def read_limits(
         if numeric is None:
             continue
         if len(numeric.data) != len(joints) or not np.all(np.asarray(numeric.data) > 0.0):
-            raise FileFormatError(f"{path}: numeric {name!r} needs {len(joints)} positive values, one for each joint")
+            raise FileFormatError(
+                f"{path}: <numeric name={name!r}> needs {len(joints)} positive values in data, one for each joint"
+            )
         values[:] = numeric.data
     if root.tag == "robot":
         for element in root.all("joint"):

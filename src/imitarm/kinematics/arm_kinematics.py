@@ -216,7 +216,7 @@ class ArmKinematics:
         """Return the index of the site that marks the frame ``"tool"`` or ``"flange"``.
 
         Raises:
-            UnknownNameError: if the frame is not known.
+            UnknownNameError: if ``frame`` is neither ``"tool"`` nor ``"flange"``.
         """
         if text(frame, "frame") not in ("tool", "flange"):
             raise UnknownNameError.among("frame", frame, ("tool", "flange"))
@@ -350,7 +350,7 @@ def find_posture(
 
     Raises:
         UnreachableError: if no posture reaches the pose; the message names the pose and the error of the best posture.
-        UnknownNameError: if the frame is not known.
+        UnknownNameError: if ``frame`` is neither ``"tool"`` nor ``"flange"``.
         InputError: if another argument can't be used.
     """
     if not isinstance(arm, ArmKinematics):

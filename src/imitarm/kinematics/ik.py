@@ -68,10 +68,10 @@ class IKSolver:
     Here, each task has a Jacobian :math:`J_i` and a target :math:`t_i`, and :math:`v_p` is the joint velocity of the
     previous step. The rows :math:`A_j v \ge b_j` have the prices (penalty weights) :math:`c_j`. Rows without a finite
     price are hard constraints, which are kept whenever the boxes allow it. If the boxes contradict these constraints,
-    the solver first minimises the sum of the squared violations. A violation is measured in rad/s along its row. The
-    tasks then have second priority. The methods ``"dls"``, ``"dls_small_angle"`` and ``"svd"`` accept one
-    :class:`~imitarm.kinematics.tasks.TwistTask` and optionally one :class:`~imitarm.kinematics.tasks.PostureTask`.
-    These methods accept no limits except boxes:
+    the solver first minimises the sum of the squared violations. The violation of row j is
+    :math:`(b_j - A_j v) / |A_j|` [rad/s]. The tasks then have second priority. The methods ``"dls"``,
+    ``"dls_small_angle"`` and ``"svd"`` accept one :class:`~imitarm.kinematics.tasks.TwistTask` and optionally one
+    :class:`~imitarm.kinematics.tasks.PostureTask`. These methods accept no limits except boxes:
 
     * ``"dls"``, damped least squares (thesis Eq 3.8 and 3.9), computes :math:`v = J^T (J J^T+\lambda^2)^{-1} t` with
       each joint's velocity measured in units of its limit. Let :math:`s_{min}` be the smallest singular value of J, and

@@ -165,8 +165,8 @@ def slerp(times: ArrayLike, key_times: ArrayLike, key_quaternions: ArrayLike) ->
     """Interpolate between successive key rotations along the shortest arc.
 
     Args:
-        times: query times [s], shape (n,). Before the first key the rotation is that of the first key, after the last
-            key that of the last.
+        times: query times [s], shape (n,). Before the first key time, the result is the first key rotation. After the
+            last key time, the result is the last key rotation.
         key_times: strictly increasing times [s], shape (k,).
         key_quaternions: unit quaternions wxyz, shape (k, 4).
 
@@ -315,7 +315,7 @@ class Pose:
         return np.asarray(given @ self.rotation.T + self.position)
 
     def error_to(self, target: Pose) -> Array:
-        r"""Return the translation and rotation from this pose to ``target``, in their common reference frame, (6,).
+        r"""Return the translation and rotation from this pose to ``target``, in their common frame, shape (6,).
 
         The linear part is :math:`p_{target} - p` [m], the angular part :math:`\log(R_{target} R^T)` [rad] (Lynch and
         Park, Modern Robotics, 2017, section 3.2.3).
