@@ -123,7 +123,7 @@ def test_a_live_person_is_told_what_to_do_and_tried_again(inside, monkeypatch, c
     left = answers(monkeypatch, "", "")
     assert main(["calibrate", "limbs", "webcam:0", "--seconds", "1"]) == 0
     text = capsys.readouterr().err
-    assert "facing it" in text and "Try again" in text and text.count("Press Enter to measure for 1 s") == 2
+    assert "face it" in text and "Try again" in text and text.count("Press Enter to measure for 1 s") == 2
     assert not left and source.closed
 
 
