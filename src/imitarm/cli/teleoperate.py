@@ -85,7 +85,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     output = parser.add_argument_group("output")
     output.add_argument("--record", type=Path, metavar="FILE", help="write the robot's motion as a demonstration (CSV)")
     output.add_argument("--task", default="", metavar="TEXT", help="description of the task, for the demonstration")
-    output.add_argument("--latency", type=Path, metavar="FILE", help="write the latencies of each skeleton (CSV)")
+    output.add_argument(
+        "--latency", type=Path, metavar="FILE", help="write the latency of each skeleton in each stage (CSV)"
+    )
     output.add_argument("--force", action="store_true", help="replace existing files")
 
 
@@ -220,7 +222,7 @@ def _show(arguments: argparse.Namespace, summary: Summary, robot: Robot, stream:
 
 
 def show_latencies(log: LatencyLog) -> None:
-    """Print a table of latencies with one row for each stage."""
+    """Print a table of latencies, with one row for each stage between the camera and the robot."""
     rows = [
         (stage, STAGES.get(stage, ""), str(n), *(f"{1e3 * value:.2f}" for value in values))
         for stage, n, *values in log.statistics()
@@ -267,7 +269,7 @@ class EnablePrompt:
         threading.Thread(target=self._reading, daemon=True).start()
 
     def reset(self) -> None:
-        """Forget the last problem after it has ended, so that the user is asked about the next problem."""
+        """Forget the last problem, which has ended, so that the user is asked about the next problem."""
         self._first, self._asked = False, ("", False)
 
     def __call__(self, problem: str, stopped: bool) -> bool:

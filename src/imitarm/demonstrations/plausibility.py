@@ -1,4 +1,4 @@
-"""Plausibility: checks of units, and of one motion against an arm.
+"""Check whether the units of a motion are plausible, and whether an arm can execute the motion.
 
 A remedy proposes all units that fit the numbers in the file. The checks against an arm concern joint names, joint
 units, joint limits, joint speed and reach.
@@ -167,7 +167,7 @@ def _check_reach(motion: ValidRows, arm: ArmModel) -> Iterator[Finding]:
 
 
 def reach(arm: ArmModel, *, n_samples: int = 400, seed: int = 0) -> tuple[Array, float]:
-    """Return the shoulder of an arm, and the largest distance between the shoulder and the tool's tip.
+    """Return the position of an arm's shoulder, and the largest distance from the shoulder to the tool's tip.
 
     The shoulder is the point on the first joint's axis that is nearest to the second joint's axis. Gradient ascent
     within the joint limits, from random postures, finds the distance. The result can be slightly smaller than the true

@@ -1,4 +1,4 @@
-"""RawDemonstration: a demonstration as recorded; and checks of the numbers that its file contains."""
+"""RawDemonstration: a demonstration as recorded. Checks of the numbers in its file."""
 
 from __future__ import annotations
 
@@ -378,7 +378,10 @@ class ValidRows:
         return Trajectory(self.times[keep], self.positions[keep], quaternions).from_zero().resample(_SAMPLES)
 
     def finding(self, severity: Severity, code: str, message: str, remedy: str, index: int | None = None) -> Finding:
-        """Return a finding about the valid row ``index`` (counted from 0), or about the whole motion if it is None."""
+        """Return a finding about the valid row ``index``, counted from 0.
+
+        If ``index`` is None, the finding is about the whole motion.
+        """
         return self.raw.finding(severity, code, message, remedy, None if index is None else int(self.rows[index]))
 
 

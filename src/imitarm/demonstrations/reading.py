@@ -79,7 +79,7 @@ class ReadOptions:
         text(self.task, "task")
 
     def metres(self, source: str, positions: Array, said: str | None = None) -> Array:
-        """Return ``positions`` in metres; ``said`` is the unit stated in the file.
+        """Return ``positions`` in metres; ``said`` is the unit that the file states, or None.
 
         Raises:
             FileFormatError: when the file names an unknown unit.
@@ -88,7 +88,7 @@ class ReadOptions:
         return positions * _factor(source, "units", self.units, said, LENGTH_UNITS, "m")
 
     def seconds(self, source: str, times: Array, said: str | None = None) -> Array:
-        """Return time stamps (n,) in seconds; ``said`` is the unit stated in the file.
+        """Return time stamps (n,) in seconds; ``said`` is the unit that the file states, or None.
 
         Raises:
             FileFormatError: when the file names an unknown unit.
@@ -145,7 +145,7 @@ def _factor(
 
 @dataclass(frozen=True)
 class SaidUnits:
-    """Units and quaternion order that a file states in its remarks; None for each that is not stated."""
+    """Units and quaternion order that the remarks of a file state; a value is None if no remark states it."""
 
     length: str | None = None
     time: str | None = None

@@ -118,7 +118,7 @@ class RunEvaluation:
 
     Attributes:
         run: the evaluated run.
-        metrics: measures of the run, some of them relative to the person's arm.
+        metrics: measures of the run; some of them compare the robot with the person's arm.
         tracking: how closely the tool tracked the method's target.
         target_lag: lag of the tool behind the method's target [s]; nan when the tool does not follow the target.
         hand_lag: lag of the tool behind the hand [s]; nan when the tool does not follow the hand.

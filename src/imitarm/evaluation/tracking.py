@@ -36,8 +36,8 @@ class TrueArm:
     """Positions of a person's arm, in the axes of the robot's base.
 
     Attributes:
-        times: time of each position, shape (n,) [s]; non-decreasing. These are the times of the robot's samples in the
-            run that is compared with the person.
+        times: times of the robot's samples in the run that is compared with the person, shape (n,) [s]; non-decreasing.
+            The following arrays contain one value for each of these times.
         shoulder: position of the shoulder, shape (n, 3) [m].
         elbow: position of the elbow, shape (n, 3) [m].
         wrist: position of the wrist, shape (n, 3) [m].
@@ -309,7 +309,7 @@ def elbow_angle_errors(true: TrueArm, sew: Array, periods: EngagementPeriods) ->
 
 
 def motion_end(times: ArrayLike, positions: ArrayLike, radius: float = 0.01, rest: float = 0.5) -> float:
-    """Return the time at which a point came within ``radius`` of its final position for the last time.
+    """Return the time from which on a point stays within ``radius`` of its final position [s].
 
     The final position is the mean of the positions in the last ``rest`` seconds.
 

@@ -69,8 +69,9 @@ def arm_end(spec: mujoco.MjSpec, path: Path) -> tuple[mujoco.MjsBody, list[str]]
 
     The arm ends before the jaws or fingers of a hand. Jaws and fingers are recognised by joint names such as jaw or
     finger, or as parallel joints coupled to each other (mimic joints). A short slide at the end also counts as a jaw.
-    Several short chains that branch off at the end of a longer chain count as fingers, if they are equally long or if
-    the longer chain has five joints. A short branch beside a much longer chain, such as a head or a wheel, is left out.
+    Several short chains that branch off at the end of a longer chain count as fingers if they are equally long. If the
+    longer chain has at least five joints, their lengths may differ. A short branch beside a much longer chain, such as
+    a head or a wheel, is left out.
 
     Raises:
         InputError: when no joint moves a body, or when several chains could be the arm; the message lists them.

@@ -160,7 +160,7 @@ class ArmPath:
         return radii * self.arm.cover.moves[sphere]
 
     def errors_to(self, positions: Array, quaternions: Array) -> Array:
-        """Return the displacement and the rotation vector from the tool to each given pose, shape (n, 6) [m, rad].
+        """Return the displacement and the rotation vector from the tool to each pose, shape (n, 6) [m, rad].
 
         Args:
             positions: positions of the tool's tip, shape (n, 3) [m].

@@ -204,7 +204,7 @@ def check_units(model: mujoco.MjModel, joints: tuple[str, ...], path: Path, root
             )
         widest = max(widest, float(high - low))
     if len(limited) > 1 and widest < _LEAST_ROTATION:
-        hint = "" if root.tag == "robot" else ': MJCF is in degrees unless it says <compiler angle="radian"/>'
+        hint = "" if root.tag == "robot" else ': without <compiler angle="radian"/>, angles in MJCF are in degrees'
         raise FileFormatError(
             f"{place(path, root, limited[0])}: no hinge of the arm can rotate by more than {np.degrees(widest):.2g} "
             f"degrees; check the unit of the limits{hint}"
@@ -223,8 +223,8 @@ def find_meshes(spec: mujoco.MjSpec, path: Path, root: XmlElement, package_path:
     ``package_path``, and in the folders of the environment variables ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH``.
 
     Raises:
-        FileFormatError: when a mesh is not found or has a format that can't be read; the message names the mesh,
-            its line, the paths searched and the remedy.
+        FileFormatError: when a mesh is not found, or can't be read in its format. The message names the mesh, its line,
+            the searched paths and the remedy.
     """
     folder = path.resolve().parent
     extra = [Path(entry).expanduser().resolve() for entry in package_path]
