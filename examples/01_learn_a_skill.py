@@ -1,8 +1,8 @@
-"""Learn a skill: read, check and align recordings, learn, save and load the skill, and move to another goal.
+"""Learn a skill from recordings, save and load it, and generate a motion to another goal.
 
-The recordings are part of the package: a simulated teacher guides a simulated Sawyer with a brush eight times to sweep
-crumbs into a dustpan. You can use recordings of your own robot instead; `docs/demonstrations.md` lists the file
-formats.
+The package contains the recordings. In each of the eight recordings, a simulated teacher guides a simulated Sawyer,
+which sweeps crumbs into a dustpan with a brush. You can use recordings of your own robot instead;
+`docs/demonstrations.md` lists the file formats.
 """
 
 from __future__ import annotations
@@ -38,7 +38,10 @@ def main() -> None:
     # Align. People never repeat a motion at exactly the same speed; averaging at equal times would flatten every bend.
     ready = align(shown)
     before = np.ptp([one.trajectory.duration for one in shown])
-    print(f"\naligned to {ready[0].trajectory.duration:.1f} s (before, the durations differed by {before:.1f} s)")
+    print(
+        f"\nafter alignment, every recording takes {ready[0].trajectory.duration:.1f} s; "
+        f"before, the durations differed by {before:.1f} s"
+    )
 
     # Learn. The number of Gaussians is the smallest that reproduces a demonstration it has not seen as well as any and
     # rounds off little (bias); where none does both, the one with the least held-out error. BIC alone would go on

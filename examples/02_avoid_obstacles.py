@@ -1,7 +1,10 @@
-"""Adapt a learned path to a scene: compare three methods, forbid directions, and see refusals with their reasons.
+"""Adapt a learned path to a scene with obstacles, by three methods and with forbidden directions.
 
-No robot moves in this example: `adapt` returns a path and its certified clearance. The example
-`03_reproduce_on_an_arm.py` lets a simulated robot execute such a path.
+`adapt` refuses some of the scenes.
+
+No robot moves in this example: the function `adapt` only plans. It returns a path, and a lower bound of the clearance
+along the path (the certified clearance). The example `03_reproduce_on_an_arm.py` lets a simulated robot execute such a
+path.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ def show(adaptation: Adaptation) -> None:
         f"  {adaptation.method:9s} {verdict}: {1e3 * adaptation.certified_clearance:.1f} mm certified clearance of "
         f"the path, "
         f"{int(adaptation.moved.sum())} of {len(adaptation.moved)} components moved, "
-        f"{1e3 * adaptation.rmse_to_nominal:.0f} mm from the learned path (RMS)"
+        f"{1e3 * adaptation.rmse_to_nominal:.0f} mm from the learned path on average (RMS)"
     )
     if adaptation.reason:
         print(f"            {adaptation.reason}")
@@ -62,13 +65,13 @@ def main() -> None:
     print(f"  if the brush may be lifted, it rises by up to {1e2 * over.displacement[:, 2].max():.0f} cm")
 
     # A refusal names the obstacle and the reason; its path is the best attempt, which must not be executed.
-    print("\na jar on the goal, then a jar on the dirt:")
+    print("\na jar on the goal, then a jar on the dirt (both scenes are refused):")
     for place in (skill.goal_.position, task.dirt.position):
         jar = Sphere(place, 0.03, name="jar")
         show(adapt(skill, Scene(None, [jar]), forbidden=HORIZONTAL_ONLY, **options))
 
     # Another goal: the skill first adapts its path to the goal, and the components move with it.
-    print("\nthe same scene, with the goal moved by 5 cm:")
+    print("\nthe first scene (cup and tin), with the goal moved by 5 cm:")
     goal = Pose(skill.goal_.position + np.array([0.05, 0.0, 0.0]), skill.goal_.quaternion)
     moved = adapt(skill, Scene(goal, scene.obstacles), forbidden=HORIZONTAL_ONLY, **options)
     show(moved)

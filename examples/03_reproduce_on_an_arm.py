@@ -1,7 +1,7 @@
 """Reproduce a skill on a simulated arm around obstacles, and let the simulator measure the result.
 
-The plan covers the whole arm: it guarantees the clearance of every moving part. The simulator has its own shapes,
-inertias, limits and servos. It measures whether the arm follows the plan and keeps the clearance.
+The policy plans the motion of the whole arm, so that every moving part keeps the clearance. The simulator uses its own
+shapes, inertias, limits and servos of the arm. It measures whether the arm follows the plan and keeps the clearance.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def main() -> None:
     print(
         f"  largest torque: {100 * effort.max():.0f} % of the rated torque of {arm.joint_names[int(effort.argmax())]}"
     )
-    print(f"  commands changed by a limit: {rollout.details['clamped'] or 'none'}")
+    print(f"  commands that the robot reduced to keep a limit: {rollout.details['clamped'] or 'none'}")
 
     # An impossible task is refused before the robot moves.
     jar = Box(Pose(skill.goal_.position, [1.0, 0.0, 0.0, 0.0]), [0.05, 0.05, 0.1], name="jar")

@@ -1,7 +1,7 @@
 """Load your own arm from a URDF or MJCF file: kinematics, inverse kinematics, gravity, and simulation.
 
-The example first writes a URDF file, so that it runs without other files. To load your own arm,
-load the file of that arm instead.
+The example writes a URDF file of an arm with six joints, and then loads this file. To use your own arm, load its file
+instead.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def main() -> None:
         line.append(arm.tool_pose(q))
         beside = max(beside, float(np.abs(line[-1].position - pose.position)[[0, 2]].max()))
     length = np.linalg.norm(line[-1].position - pose.position)
-    print(f"\na straight line of {100 * length:.1f} cm: the tool deviates by at most {1e3 * beside:.2f} mm")
+    print(f"\nalong a straight line of {100 * length:.1f} cm, the tool deviates by at most {1e3 * beside:.2f} mm")
 
     # The gravity torques without and with the gripper, also as a fraction of the torque limits.
     holding = arm.gravity_torque(q)

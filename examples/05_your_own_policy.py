@@ -1,7 +1,8 @@
-"""Write your own policy, register it, and let it reproduce a skill under the same conditions as a built-in policy.
+"""Write your own policy and register it. Then compare it with a built-in policy under the same conditions.
 
-A policy sees an `Observation` (time, state of the arm, pose of the tool, scene) and returns a `Command`. All policies
-share the robot, the safety filter, the inverse kinematics, and the measurement of clearance.
+In every control step, a policy receives an `Observation` (time, state of the arm, pose of the tool, scene) and returns
+a `Command`. The robot, the safety filter, the inverse kinematics and the measured clearance are the same for all
+policies.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from imitarm import (
 
 
 class Repelled(Policy):
-    """Follow the learned path in time; obstacles near the tool push it away (repulsive force of thesis Eq 2.19)."""
+    """Follow the learned path. Near an obstacle, a repulsive force pushes the tool away (thesis Eq 2.19)."""
 
     influence, gain = 0.06, 4.0  # [m], [1/s]
 

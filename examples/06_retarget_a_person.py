@@ -1,8 +1,8 @@
-"""Learn from a person in front of a camera: convert five recordings to demonstrations, and learn and reproduce a skill.
+"""Learn a skill from a person in front of a camera: convert five recordings to demonstrations, learn, and reproduce.
 
-The person and the noisy camera are simulated, so that the example runs anywhere. To use a recording of your own, open
-it with `open_source("take.csv")`. The true motion of the simulated person is known, so the errors of the robot can be
-measured.
+The person and the noisy camera are simulated, so you need no camera. To use your own recording, open it with
+`open_source("take.csv")`. The true motion of a simulated person is known, so the example can print the errors of the
+robot.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def take(number: int) -> SkeletonSource:
 
 
 def following(run: Retargeting) -> slice:
-    """Return the part of a run in which the robot followed the person, as a demonstration."""
+    """Return a demonstration from the part of a run in which the robot followed the person."""
     led = np.flatnonzero(run.states == "following")
     return slice(int(led[0]), int(led[-1]) + 1)
 

@@ -1,8 +1,8 @@
 """Reach into an open box among obstacles, with a skill learned from one teacher and from several teachers.
 
-The teachers are synthetic. Each of them has habits that are the same in all of his demonstrations. A skill that is
-learned from one teacher contains his habits. With several teachers, most habits average out. The box and the obstacles
-are solid bodies in the simulator, and the plan covers the whole arm.
+The teachers are synthetic. Each teacher has habits, which are errors that he repeats in all of his demonstrations. A
+skill that is learned from one teacher contains his habits. In a skill of several teachers, most habits average out. The
+box and the obstacles are solid bodies in the simulator. The policy plans the motion of the whole arm.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Teach industrial robot arms by demonstration.
 
-The public names are listed in ``__init__.pyi`` and imported when first used, so that ``import imitarm`` stays fast.
+The file ``__init__.pyi`` lists the public names. A name is imported only when it is first used, so ``import imitarm``
+is fast.
 """
 
 import lazy_loader

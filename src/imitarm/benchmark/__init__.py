@@ -1,1 +1,1 @@
-"""Benchmarks: reproducible random scenes and recordings, runs that can be resumed, saved results, and tables."""
+"""Benchmarks: they make random scenes and recordings from seeds, run the methods, save the results and print tables."""

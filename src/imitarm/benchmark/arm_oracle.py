@@ -1,15 +1,16 @@
 """Oracles for a whole arm among moving obstacles: a search over postures and time.
 
-The tool may be at any place of a grid. The grid extends along the learned path, to its sides and upwards. The arm has
-one posture for each place. In each layer of time, the arm may stay or move to a neighbouring place. The search finds
-the motion of least cost on which all links keep a margin from every obstacle. It shares no code with the compared
-methods.
+The tool moves between the places of a grid. The grid extends along the learned path, to its sides and upwards. The arm
+has one posture for each place. Time is divided into layers of 0.05 s. From one layer to the next, the arm may stay or
+move to a neighbouring place. The search finds the motion of least cost on which all links keep a margin from every
+obstacle. The oracles do not use the search of any compared method.
 
-* ``oracle-future`` knows the true motion of all obstacles. If it finds no motion, the scene may have no solution.
-* ``oracle-tracks`` knows only the tracked obstacles, like the compared methods, and searches again every 0.3 s.
+* ``oracle-future`` knows the true future motion of all obstacles. If this oracle finds no motion, the scene may have no
+  solution.
+* ``oracle-tracks`` knows only what the camera has observed, like the compared methods. It searches again every 0.3 s.
 
-Both may move faster or more slowly than the learned motion, or back along the path. A scene that they do not solve may
-still have a solution with other postures.
+Both oracles may move faster or more slowly than the learned motion, or back along the path. A scene that both fail to
+solve may still have a solution with other postures.
 """
 
 from __future__ import annotations
@@ -57,14 +58,14 @@ _LAG, _DISPLACED = 1.0, 25.0  # cost per layer of one second of lag, squared; of
 
 @dataclass(frozen=True, eq=False)
 class Postures:
-    """The postures between which the search chooses, on a grid of places along, beside and above the path.
+    """The postures that the search may use: one posture for each place of a grid along, beside and above the path.
 
     Attributes:
         arm: the arm with its tool.
-        joints: shape (n_places, n_aside, n_above, n_joints) [rad].
+        joints: joint angles of the posture at each place, shape (n_places, n_aside, n_above, n_joints) [rad].
         centers: centres of the spheres that cover the arm, shape (n_places, n_aside, n_above, n_spheres, 3) [m].
-        usable: whether the arm reaches the place, shape (n_places, n_aside, n_above).
-        learned: time of each place in the learned motion, shape (n_places,) [s].
+        usable: whether the arm reaches the place within its joint limits, shape (n_places, n_aside, n_above).
+        learned: time at which the learned motion passes each place along the path, shape (n_places,) [s].
     """
 
     arm: ArmModel
@@ -75,7 +76,10 @@ class Postures:
 
     @classmethod
     def of(cls, skill: Skill, arm: ArmModel, start: Array) -> Postures:
-        """Compute the postures of an arm for a skill, from its start posture (n_joints,) [rad]."""
+        """Compute the postures for the path of a skill.
+
+        ``start`` is the start posture of the arm, shape (n_joints,) [rad].
+        """
         learned = np.linspace(0.0, skill.duration_, _PLACES)
         path = skill.nominal(np.linspace(0.0, skill.duration_, 400))
         positions, quaternions = path.at(learned)
@@ -117,21 +121,22 @@ class Postures:
 
 @lru_cache(maxsize=2)
 def postures_of(skill: Skill, arm: ArmModel, start: tuple[float, ...]) -> Postures:
-    """Return the postures of an arm for a skill; they are computed once."""
+    """Return the postures of an arm for a skill. Repeated calls with the same arguments reuse the result."""
     return Postures.of(skill, arm, np.array(start))
 
 
 def search(
     postures: Postures, place: tuple[int, int, int], free: list[Free], due: Array, *, arrives: bool
 ) -> list[tuple[int, int, int]] | None:
-    """Return the chain of places of least cost, one for each layer; None if there is none.
+    """Return the cheapest sequence of places, one place for each layer of time; None if no sequence is possible.
 
     Args:
         postures: the postures.
-        place: where the chain begins.
-        free: for each layer, which postures are free.
-        due: place that the learned motion has reached in each layer, as a real number, shape (n_layers,).
-        arrives: whether the chain must end at the goal.
+        place: first place of the sequence, as indices along, beside and above the path.
+        free: for each layer of time, which postures keep the margin; arrays of shape (n_places, n_aside, n_above).
+        due: index of the place along the path that the learned motion has reached in each layer, shape (n_layers,). The
+            index may be fractional.
+        arrives: whether the sequence must end at the goal.
     """
     shape = postures.usable.shape
     moves = sorted(product((-1, 0, 1), repeat=3), key=lambda m: sum(i * i for i in m))
@@ -170,20 +175,21 @@ def search(
 
 
 def _slices(move: tuple[int, ...], shape: tuple[int, ...]) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
-    """Return the places that are reached by a move, and the places from which it leads there."""
+    """Return the places that a move can reach, and for each of them the place from which the move starts."""
     here = tuple(slice(max(m, 0), n + min(m, 0)) for m, n in zip(move, shape, strict=True))
     there = tuple(slice(max(-m, 0), n + min(-m, 0)) for m, n in zip(move, shape, strict=True))
     return here, there
 
 
 class ArmOracle(Policy):
-    """Follow the joint motion that the search finds, with the true future or with the tracked obstacles.
+    """Follow the joint motion that the search finds.
 
     Args:
         skill: skill to reproduce.
-        truth: the true obstacles over time.
+        truth: the true motion of the obstacles.
         start: start posture, shape (n_joints,) [rad].
-        tracked: whether the search uses the observed obstacles instead, again and again.
+        tracked: False: search once, with the true motion of the obstacles. True: search again every 0.3 s, with the
+            observed obstacles.
         options: arguments of :class:`~imitarm.policies.Policy`; ``arm`` is required.
     """
 
@@ -192,17 +198,17 @@ class ArmOracle(Policy):
     def __init__(self, skill: Skill, truth: MovingScene, start: Array, *, tracked: bool, **options: Any) -> None:
         super().__init__(skill, **options)
         if self.arm is None:
-            raise InputError("ArmOracle: searches over postures of an arm; pass arm=ArmModel.load(...)")
+            raise InputError("ArmOracle: the search needs an arm; pass arm=ArmModel.load(...)")
         self._arm, self.truth, self.tracked = self.arm, truth, tracked
         self._postures = postures_of(skill, self.arm, tuple(start.tolist()))
         self._end = _LATE * LATEST * skill.duration_
         self._goal = skill.nominal(np.array([0.0, skill.duration_])).positions[-1]
 
     def reset(self, observation: Observation) -> None:
-        """Search.
+        """Search for a motion from the present state of the arm.
 
         Raises:
-            InfeasibleError: when the true future is known, and no motion is found.
+            InfeasibleError: when ``tracked`` is False and the search finds no motion.
         """
         self._times, self._motion = np.zeros(1), observation.state.q[None]
         self._searched, self._place = -np.inf, (0, len(_ASIDE) // 2, 0)
@@ -210,7 +216,7 @@ class ArmOracle(Policy):
             raise InfeasibleError("the search finds no motion")
 
     def step(self, observation: Observation, dt: float) -> Command:
-        """Return the joint velocity that follows the motion found last."""
+        """Return the joint velocity that follows the motion of the latest successful search."""
         time, q = observation.time, observation.state.q
         if self.tracked and time - self._searched >= _PERIOD - 1e-9:
             self._searched = time
@@ -220,7 +226,7 @@ class ArmOracle(Policy):
         return Command(self._arm.jacobian(q) @ velocity, velocity, status=Status.AVOIDING, reason="searched")
 
     def finished(self, observation: Observation) -> bool:
-        """Return whether the tool is at the goal, and the learned motion is over."""
+        """Return whether the tool is at the goal and the duration of the learned motion has passed."""
         away = np.linalg.norm(observation.tool_to_base.position - self._goal)
         return bool(observation.time >= self.skill.duration_ and away < _ARRIVED)
 
@@ -228,7 +234,7 @@ class ArmOracle(Policy):
         return np.array([np.interp(time, self._times, column) for column in self._motion.T])
 
     def _search(self, time: float, observation: Observation) -> bool:
-        """Look for a motion from now on; return whether one was found."""
+        """Search for a motion that begins now; return whether the search found a motion."""
         until = min(time + _AHEAD, self._end) if self.tracked else self._end
         times = np.arange(time, until + 1e-9, LAYER)
         if len(times) < 3:

@@ -1,6 +1,7 @@
-"""``imitarm benchmark avoidance``: how often each method keeps its clearance in hundreds of random scenes.
+"""``imitarm benchmark avoidance``: count in how many random scenes each method keeps the required clearance.
 
-Success is evaluated at 4000 points of the path that would be executed, not at the coarser samples of the plan.
+The benchmark interpolates each planned path at 4000 points, which are closer together than the samples of the plan. It
+measures the clearance at these points.
 """
 
 from __future__ import annotations
@@ -47,8 +48,8 @@ class Outcome:
         kept: whether the path keeps the required clearance (with 0.5 mm tolerance) at all evaluated points.
         collision_free: whether the path touches no obstacle at any evaluated point.
         clearance: smallest distance to an obstacle at the evaluated points [m].
-        rmse: root mean square distance to the nominal path [m].
-        unmoved: fraction of the Gaussian components that were not moved.
+        rmse: root mean square distance between the returned path and the learned path [m].
+        unmoved: fraction of the Gaussian components that the method did not move.
         seconds: compute time [s].
     """
 
@@ -62,7 +63,7 @@ class Outcome:
 
 
 def learn(*, planar: bool) -> tuple[Skill, Array]:
-    """Learn the S-shaped reach with 8 components; return the skill and its path (400, 3) [m]."""
+    """Learn an S-shaped reach with 8 Gaussian components; return the skill and its path, shape (400, 3) [m]."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DegenerateAxisWarning)  # a planar reach has no spread in z, on purpose
         skill = Skill(n_components=8).fit(s_shaped_demonstrations(planar=planar))
@@ -70,7 +71,7 @@ def learn(*, planar: bool) -> tuple[Skill, Array]:
 
 
 def evaluate(case: Case, adaptation: Adaptation) -> Outcome:
-    """Measure an adaptation at many points along its path."""
+    """Measure the clearance and the error of an adapted path in its scene."""
     times = adaptation.trajectory.times
     points, _ = adaptation.trajectory.at(np.linspace(times[0], times[-1], _DENSE))
     clearance = float(np.min(case.scene.clearance(points))) - TOOL_RADIUS
@@ -86,7 +87,7 @@ def evaluate(case: Case, adaptation: Adaptation) -> Outcome:
 
 
 def run_family(skill: Skill, cases: Iterable[Case], method: str = "certified") -> list[Outcome]:
-    """Let one method adapt one skill to each of the scenes."""
+    """Adapt the path of a skill to each scene by one method, and return one outcome for each scene."""
     outcomes = []
     for case in cases:
         adaptation = adapt(
@@ -132,13 +133,14 @@ def success_table(
     methods: Sequence[str] = tuple(ADAPTERS),
     on_done: Callable[[int, int], None] | None = None,
 ) -> Table:
-    """Run every method in the scenes of every family, and return the table of results.
+    """Run every method in random scenes of every family, and return the table of results.
 
     Args:
         seeds: number of scenes in each family.
         first: first seed; seeds from 2000 on are for testing.
         methods: names in :data:`imitarm.policies.adaptation.ADAPTERS`.
-        on_done: function called with the number of finished table rows and the total number of rows.
+        on_done: function that is called after each table row, with the number of finished rows and the total number of
+            rows.
     """
     rows: list[tuple[str, ...]] = []
     planned = [(planar, *learn(planar=planar)) for planar in (True, False)]

@@ -1,8 +1,8 @@
-"""Controls of the avoidance benchmark: methods whose results show that the benchmark measures what it should.
+"""Controls of the avoidance benchmark: methods with a known result show whether the benchmark measures correctly.
 
-* ``no-avoidance`` follows the learned path. If it succeeded, the scenes would test nothing.
-* ``aims-at-obstacle`` steers through the middle of the nearest obstacle. If it ever succeeded, the measures would be
-  wrong.
+* ``no-avoidance`` follows the learned path. If this method succeeded, the obstacles would not block the learned path.
+* ``aims-at-obstacle`` steers through the middle of the nearest obstacle. If this method ever succeeded, the benchmark
+  would measure contacts wrongly.
 * ``oracle`` is the independent search of :mod:`imitarm.benchmark.refusal_oracle`. It decides which scenes have a
   solution. If a method solved a scene that the oracle proves impossible, the method or the oracle would be wrong.
 """
@@ -45,15 +45,16 @@ class NoAvoidance(PathPolicy):
 
 
 class AimsAtObstacle(PathPolicy):
-    r"""Displace the learned path so that it passes through the middle of the nearest obstacle.
+    r"""Displace the learned path so that it passes through the middle of the obstacle that is nearest to the path.
 
-    Let c be the middle of the obstacle [m], and j the sample of the learned path that is nearest to c.
-    The displaced path passes through c at sample j:
+    Let c be the middle of this obstacle [m], and j the index of the learned sample that is nearest to c. The displaced
+    path passes through c at sample j:
 
     .. math:: x_i = \bar x_i + w_i (c - \bar x_j), \qquad w_j = 1
 
     Here, x_i is sample i of the displaced path and x̄_i is sample i of the learned path [m]. The weight w_i is 1 at
-    sample j and falls smoothly to 0 on both sides of it. No displacement has a component in a forbidden direction.
+    sample j, and falls smoothly to 0 before and after this sample. No displacement has a component in a forbidden
+    direction.
     """
 
     title: ClassVar[str] = "aims at the obstacle"
@@ -80,7 +81,7 @@ class Oracle(PathPolicy):
 
     Args:
         skill: skill to reproduce.
-        pinned: times at which the path must not be displaced [s].
+        pinned: times at which the path must pass exactly through the learned path [s].
         options: arguments of :class:`~imitarm.policies.path_policy.PathPolicy`.
 
     Attributes:
@@ -120,7 +121,7 @@ class Oracle(PathPolicy):
 
 
 def middle(obstacle: Obstacle) -> Array:
-    """Return a point inside a convex obstacle: the mean of its surface points in 26 directions, shape (3,) [m]."""
+    """Return a point inside a convex obstacle: the mean of its farthest points in 26 directions, shape (3,) [m]."""
     grid = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     directions = grid[np.any(grid != 0.0, axis=1)]
     return np.asarray(obstacle.support(directions / np.linalg.norm(directions, axis=1, keepdims=True)).mean(axis=0))

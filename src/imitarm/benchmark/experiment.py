@@ -1,4 +1,4 @@
-"""Experiment and Result: run one method on one recording or in one closed-loop trial, and save the result in a file."""
+"""Experiment and Result: run one retargeting method on a recording or in a closed-loop trial, and save the result."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ from imitarm.tasks.stack_run import DT, run_stack
 REPLAYS = (*KINDS, CAPTURED)
 """Tasks in which a method follows a recording."""
 LIVE = "live stacking"
-"""The closed-loop task: a simulated person leads the robot through a retargeting method, and stacks cubes with it."""
+"""The closed-loop task: a simulated person watches the robot and leads it through a retargeting method to stack
+cubes."""
 ROBOTS = ("sawyer", "panda")
 FORMAT = "imitarm-result"
 VERSION = 1
@@ -38,11 +39,11 @@ _NO_RECORDING = "the recording could not be made"
 
 @dataclass(frozen=True)
 class Method:
-    """A retargeting method with its options; each method is a row of the tables.
+    """A retargeting method with its options. The tables have one row for each method.
 
     Attributes:
         retargeter: name of the method in :data:`imitarm.retarget.RETARGETERS`.
-        label: name of the row in tables and figures; if empty, the title of the retargeter.
+        label: name of the method in tables and figures; if empty, the title of the retargeter is used.
         options: options for the method's constructor.
     """
 
@@ -52,19 +53,19 @@ class Method:
 
     @property
     def title(self) -> str:
-        """The name in tables and figures."""
+        """The name of the method in tables and figures."""
         return self.label or RETARGETERS[self.retargeter].title
 
     def __call__(self, arm: ArmModel, correspondence: Correspondence, *, dt: float = 0.01) -> Retargeter:
-        """Return the retargeter for this arm and this person."""
+        """Create the retargeter for ``arm``; ``dt`` is the control period [s]."""
         return RETARGETERS[self.retargeter](arm, correspondence, dt=dt, **self.options)
 
 
 MAIN: Mapping[str, Method] = {name: Method(name) for name in RETARGETERS}
 """Every registered method with its default options.
 
-The thesis compares its method Me with the baselines M1 to M3 (Table 3.1 and Figs 3.6 to 3.8). ``thesis`` is Me with
-corrected equations, ``m1`` to ``m3`` are our interpretations of the baselines, and ``modern`` is the method of this
+The thesis compares its method Me with the baselines M1 to M3 (Table 3.1 and Figs 3.6 to 3.8). ``thesis`` is the method
+Me with corrected equations. ``m1`` to ``m3`` are our interpretations of the baselines. ``modern`` is the method of this
 library. Other packages can add methods by entry points.
 """
 
@@ -76,9 +77,9 @@ VARIANTS: Mapping[str, Method] = {
     "m1-scaled": Method("m1", "M1, scaled", {"velocity_scaling": True}),
     "m3-scaled": Method("m3", "M3, scaled", {"velocity_scaling": True}),
 }
-"""Methods with changed options, to show the effects of the options. "Me-thesis" fits one NURBS curve to the whole
-recording and uses the small-angle term of the thesis. "as printed" keeps the misprints of the thesis, except those that
-stop the method from running. "scaled" slows all joints down together where one joint would be too fast."""
+"""Methods with changed options, which show the effects of the options. "Me-thesis" fits one NURBS curve to the whole
+recording and uses the small-angle term of the thesis. "as printed" keeps the misprints of the thesis that still give a
+program that runs. "scaled" slows all joints down by a common factor when one joint would be too fast."""
 
 METHODS: Mapping[str, Method] = {**MAIN, **VARIANTS}
 """All methods by name."""
@@ -97,20 +98,22 @@ def method(name: str) -> Method:
 
 @dataclass(frozen=True)
 class Experiment:
-    """What defines one run of one method in one task. All values are plain, so another process or machine can run it.
+    """The definition of one run of one method in one task.
 
-    ``Experiment("edge", "modern", seed=3).run()`` makes the recording, lets the method follow it, and measures the
-    result.
+    Another process or machine can run it, because it contains only text and numbers.
+
+    ``Experiment("edge", "modern", seed=3).run()`` makes the recording, runs the method on the recording, and measures
+    the result.
 
     Attributes:
         task: one of :data:`REPLAYS`, or :data:`LIVE`.
         method: one of :data:`METHODS`.
         robot: one of :data:`ROBOTS`; stacking needs the Sawyer.
-        seed: seed of the person.
-        repeat: index of the recording or trial of this person, from 0.
-        seconds: approximate duration of reaches and drawings [s].
+        seed: seed of the simulated person.
+        repeat: which recording or trial of this person, counted from 0.
+        seconds: approximate duration of the recorded reaching and drawing motions [s].
         sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
-        data: folder of real recordings, for the task with motion capture.
+        data: folder of real recordings, which the task with motion capture needs.
 
     Raises:
         UnknownNameError: when task, method or robot is not known.
@@ -138,7 +141,10 @@ class Experiment:
 
     @property
     def plan(self) -> Plan:
-        """Definition of the recording to follow; the live task uses the seeds of a stacking recording."""
+        """Definition of the recording that the method follows.
+
+        The closed-loop task has no recording, but uses the seeds of a recording of stacking.
+        """
         kind = "stacking" if self.task == LIVE else self.task
         return Plan(kind, self.seed, self.repeat, self.seconds, self.sigma, self.data)
 
@@ -151,8 +157,8 @@ class Experiment:
         """Run the method, and measure the result.
 
         Args:
-            folder: folder in which the recording is saved, so that the next method can use the same file; None: not
-                saved.
+            folder: folder in which the recording is saved, so that other methods can use the same file; None: the
+                recording is not saved.
 
         Returns:
             The result. If the method fails, the result has no values, and ``failure`` states the reason.
@@ -166,7 +172,10 @@ class Experiment:
         return Result(self, code_version(), values, failure, clock.perf_counter() - began)
 
     def recording(self, folder: Path | None = None) -> MappingRecording:
-        """Return the recording; it is read from ``folder``, or made and saved there if it does not exist yet."""
+        """Return the recording.
+
+        If ``folder`` already contains it, it is read; otherwise it is made and saved in ``folder``.
+        """
         if folder is None:
             return make_recording(self.plan, _arm(self.robot))
         facts = json.dumps([asdict(self.plan), self.robot, code_version()])
@@ -204,17 +213,17 @@ class StackingOutcome:
     Torques are measured at the drives, so they include the effect of contacts.
 
     Attributes:
-        success: whether four cubes stand in order.
+        success: whether four cubes stand on one another in the right order.
         failure: one of :data:`imitarm.tasks.stack.FAILURES`; empty on success.
         reason: explanation of the outcome in words.
         stacked: number of cubes in the tower at the end.
-        time: time at which the person finished, or the time limit [s].
+        time: time at which the person finished, or the time limit if the person did not finish [s].
         path_length: path length of the tool [m].
         mean_torque: mean of the absolute torque of each joint [N m].
         rms_torque: root mean square of each joint's torque [N m].
         effort: integral over time of the squared torques, summed over the joints [N^2 m^2 s].
-        peak_torque_ratio: largest torque divided by the rated torque of that joint.
-        velocity_ratio: largest measured joint velocity divided by the limit of that joint.
+        peak_torque_ratio: largest ratio of a joint's torque to the rated torque of this joint.
+        velocity_ratio: largest ratio of a joint's measured velocity to the velocity limit of this joint.
         clamped: number of control steps in which the robot's limits changed the command.
     """
 
@@ -235,12 +244,12 @@ class StackingOutcome:
 def run_stacking(
     method_name: str, person: int, repeat: int = 0, sigma: float | None = None, arm: ArmModel | None = None
 ) -> StackingOutcome:
-    """Let a simulated person stack cubes with a method, a noisy camera and simulated contacts, and measure the outcome.
+    """Simulate one trial: a person with a noisy camera stacks cubes through a retargeting method. Return the outcome.
 
     Args:
         method_name: one of :data:`METHODS`.
         person: seed of the person.
-        repeat: index of the trial of this person, from 0.
+        repeat: which trial of this person, counted from 0.
         sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
         arm: model of the Sawyer with the gripper; None: the model is loaded here.
     """
@@ -263,7 +272,7 @@ def run_stacking(
 
 
 def camera_maker(sigma: float | None) -> Callable[[int], SkeletonCamera]:
-    """Return a function that makes a camera from a seed.
+    """Return a function that makes a simulated camera from a seed.
 
     Args:
         sigma: standard deviation of the camera's error [m]; None: the seed also determines this standard deviation.
@@ -272,7 +281,7 @@ def camera_maker(sigma: float | None) -> Callable[[int], SkeletonCamera]:
 
 
 def count_failures(outcomes: Sequence[str]) -> str:
-    """Return a text with the number of failures of each kind, most frequent first.
+    """Return a text with the number of failures of each kind; the most frequent kind comes first.
 
     Args:
         outcomes: one text for each trial: the kind of failure, or an empty text after a success.
@@ -288,10 +297,11 @@ class Result:
     Attributes:
         experiment: experiment that was run.
         code: version of the code that ran, see :func:`imitarm.benchmark.provenance.code_version`.
-        values: measures by name. For a recording, the measures are those of
-            :class:`~imitarm.evaluation.mapping_metrics.MappingMetrics`, ``recorded`` [s], ``beyond_reach`` (fraction of
-            the time) and the ``notes`` of the method. For a closed-loop trial, the measures are the attributes of
-            :class:`StackingOutcome`. Empty after a failure.
+        values: measures by name; empty after a failure. For a recording, the measures are the attributes of
+            :class:`~imitarm.evaluation.mapping_metrics.MappingMetrics`. There are three further measures: ``recorded``
+            is the duration of the recording [s]. ``beyond_reach`` is the fraction of time in which the target is out of
+            reach. ``notes`` are the method's own notes. For a closed-loop trial, the measures are the attributes of
+            :class:`StackingOutcome`.
         failure: reason why there are no measures; empty if there are measures.
         seconds: computing time [s].
     """
@@ -304,7 +314,7 @@ class Result:
 
     @property
     def without_recording(self) -> bool:
-        """Whether the recording is missing, which is not a failure of the method."""
+        """Whether the recording could not be made; in this case, the method has not failed."""
         return f": {_NO_RECORDING}: " in self.failure
 
     def value(self, name: str) -> float:
@@ -314,12 +324,15 @@ class Result:
 
     @staticmethod
     def path(folder: Path, experiment: Experiment) -> Path:
-        """Return the path of an experiment's result; the file name contains a hash of the configuration."""
+        """Return the path of the file for an experiment's result.
+
+        The file name contains a hash of the experiment's definition.
+        """
         facts = json.dumps(asdict(experiment), sort_keys=True)
         return folder / f"{experiment.name}-{hashlib.sha256(facts.encode()).hexdigest()[:12]}.json"
 
     def save(self, folder: Path) -> Path:
-        """Write the result to a file without ever leaving an incomplete file, and return the path."""
+        """Write the result to a file, and return its path. An interruption never leaves an incomplete file."""
         folder.mkdir(parents=True, exist_ok=True)
         path = self.path(folder, self.experiment)
         content = {
@@ -336,7 +349,7 @@ class Result:
 
     @classmethod
     def load(cls, path: Path) -> Result:
-        """Read a result that :meth:`save` wrote; null in the file stands for nan.
+        """Read a result that :meth:`save` wrote; the value null in the file becomes nan.
 
         Raises:
             FileFormatError: when the file is not a result, or a result of another version.
