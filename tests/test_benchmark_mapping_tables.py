@@ -94,4 +94,6 @@ def test_it_is_said_which_persons_they_were():
     judged = [replay("modern", p, 1.0) for p in (TEST, TEST + 1)]
     assert recordings_table(Results(judged)).note.endswith("Persons 200 to 201.")
     seen = [live("modern", 0, 0)]
-    assert success_table(Results(seen)).note.endswith("Persons below 200 are for developing methods.")
+    assert success_table(Results(seen)).note.endswith(
+        "Persons with numbers below 200 were used for developing the methods."
+    )

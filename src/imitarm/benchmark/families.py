@@ -1,7 +1,7 @@
-"""Families of random scenes around a synthetic skill; the same seed gives the same scene on every machine.
+"""Families of random scenes with obstacles on a learned path. The same seed gives the same scene on every machine.
 
-Every scene is a :class:`Case`: obstacles, forbidden directions, and whether a solution exists. Whether a solution
-exists follows from the construction of the scene, not from any of the tested methods.
+Every scene is a :class:`Case`: obstacles, forbidden directions, and whether a solution exists. The construction of the
+scene determines whether a solution exists.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _WALL = 2.0  # [m] length of a wall that can't be passed at its outer end
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One scene, which a method must solve or refuse.
+    """One scene. A method must solve the scene if a solution exists, and refuse it otherwise.
 
     Attributes:
         scene: the obstacles.
@@ -64,7 +64,7 @@ class _Draft(NamedTuple):
 def random_obstacle(
     rng: np.random.Generator, centre: Array, *, planar: bool, kinds: tuple[str, ...] = KINDS
 ) -> Obstacle:
-    """Make an obstacle of a random shape, 2 to 10 cm in size; in a planar scene, it stands upright on the table."""
+    """Make an obstacle of a random shape, 2 to 10 cm in size. If ``planar`` is True, the obstacle stands upright."""
     return _draft(rng, centre, planar, kinds).build()
 
 
@@ -97,7 +97,7 @@ def _draft(rng: np.random.Generator, centre: Array, planar: bool, kinds: tuple[s
 
 
 def sparse_clutter(seed: int, path: Array, *, n_obstacles: int, planar: bool, kinds: tuple[str, ...] = KINDS) -> Case:
-    """Make a scene of obstacles of all shapes on the path, far apart.
+    """Make a scene with obstacles of random shapes on the path, far apart from one another.
 
     The scene is solvable, because a path can go around each obstacle.
 
@@ -116,12 +116,12 @@ def sparse_clutter(seed: int, path: Array, *, n_obstacles: int, planar: bool, ki
 def obstacles_apart(
     rng: np.random.Generator, path: Array, n_obstacles: int, *, planar: bool, kinds: tuple[str, ...] = KINDS
 ) -> tuple[Obstacle, ...]:
-    """Place obstacles on a path, far from one another, from the start and from the goal.
+    """Place obstacles on a path. They stand far from one another, from the start and from the goal.
 
     Args:
         rng: source of the random numbers.
         path: nominal path, shape (n, 3) [m].
-        n_obstacles: how many.
+        n_obstacles: number of obstacles.
         planar: whether the obstacles stand upright, at the height of the path.
         kinds: names of the shapes from which obstacles are chosen.
 
@@ -151,11 +151,13 @@ def obstacles_apart(
         elif rng.random() < 0.02:  # painted into a corner: begin again
             chosen.clear()
             centres.clear()
-    raise InputError(f"no place for {n_obstacles} obstacles on the path; choose fewer, or the skill of a longer path")
+    raise InputError(
+        f"no place for {n_obstacles} obstacles on the path; choose fewer obstacles, or a skill with a longer path"
+    )
 
 
 def narrow_gap(seed: int, path: Array, *, solvable: bool) -> Case:
-    """Make a wall across a planar path with one gap, 5 to 30 mm wider or narrower than necessary.
+    """Make a wall with one gap across a planar path. The gap is 5 to 30 mm wider or narrower than the tool needs.
 
     Args:
         seed: number of the scene.
@@ -172,9 +174,9 @@ def narrow_gap(seed: int, path: Array, *, solvable: bool) -> Case:
 def wall_with_gap(
     rng: np.random.Generator, path: Array, width: float, *, shift: float = 0.04, height: float = 0.3
 ) -> tuple[Box, Box]:
-    """Make a wall across the middle of a path, in two halves with a gap between them.
+    """Make a wall across the middle of a path. The wall consists of two halves with a gap between them.
 
-    The wall is so long that the path can't go around it.
+    The wall is so long that a path can pass only through the gap.
 
     Args:
         rng: source of the random numbers.
@@ -197,7 +199,7 @@ def wall_with_gap(
 
 
 def covered_end(seed: int, path: Array, *, planar: bool) -> Case:
-    """Make a scene in which an obstacle covers the start or the goal, so that it must be refused.
+    """Make a scene in which an obstacle covers the start or the goal. A method must refuse this scene.
 
     Args:
         seed: number of the scene.
@@ -210,7 +212,10 @@ def covered_end(seed: int, path: Array, *, planar: bool) -> Case:
 
 
 def covering_sphere(rng: np.random.Generator, point: Array, *, planar: bool) -> Sphere:
-    """Make a sphere so near to ``point`` (3,) [m] that a tool there touches it or has too little clearance."""
+    """Make a sphere near ``point``, shape (3,) [m].
+
+    A tool at this point touches the sphere or has too little clearance.
+    """
     radius = rng.uniform(0.02, 0.05)
     direction = rng.normal(size=3) * ([1.0, 1.0, 0.0] if planar else [1.0, 1.0, 1.0])
     direction /= np.linalg.norm(direction)

@@ -1,4 +1,4 @@
-"""The mapping benchmark, which compares retargeting methods: its experiments, tables, and output files."""
+"""The mapping benchmark compares retargeting methods: it runs experiments, and writes tables and files."""
 
 from __future__ import annotations
 
@@ -34,25 +34,25 @@ CAMERAS = 8  # simulated cameras before the captured arm, which is that of one p
 
 @dataclass(frozen=True)
 class MappingBenchmark:
-    """Which experiments the mapping benchmark runs.
+    """The choice of experiments for the mapping benchmark.
 
     Attributes:
         people: number of simulated persons.
-        first: number of the first person; the persons are ``first`` to ``first + people - 1``. Persons below 200 are
-            for developing methods, and persons from 200 on are for testing. Therefore no method is tested with a person
-            with whom it was tuned.
-        repeats: number of closed-loop trials of each person. The replay tasks use one recording of each kind and
+        first: number of the first person; the persons are ``first`` to ``first + people - 1``. Use persons 0 to 199 for
+            developing methods, and persons from 200 on for testing. A method is then never tested with a person with
+            whom it was tuned.
+        repeats: number of closed-loop trials of each person. The other tasks have one recording of each kind for each
             person.
         methods: names in :data:`imitarm.benchmark.experiment.METHODS`.
         kinds: kinds of recordings, from :data:`imitarm.benchmark.recordings.KINDS`.
         seconds: approximate duration of a recording [s].
         sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
-        live: whether the main methods among ``methods`` are also tested in closed loop; in these trials, the person
-            stacks cubes.
-        data: folder of real recordings; if empty, the recordings from motion capture are left out.
+        live: whether to run closed-loop trials too, in which the person stacks cubes through the robot. Only methods
+            with default options run in these trials.
+        data: folder of real recordings; if empty, the task with motion capture is left out.
 
     Raises:
-        InputError: when there is nothing to run.
+        InputError: when no experiment is selected, or a number is too small.
     """
 
     people: int = 10
@@ -71,7 +71,9 @@ class MappingBenchmark:
         if self.first < 0:
             raise InputError(f"the first person must be at least 0, got {self.first}")
         if not self.methods or not (self.kinds or self.live or self.data):
-            raise InputError("nothing to run: choose a method, and a kind of recording or closed-loop trials")
+            raise InputError(
+                "no experiment is selected: choose at least one method, and a kind of recording or closed-loop trials"
+            )
 
     def experiments(self) -> list[Experiment]:
         """Return all experiments, grouped by recording."""
@@ -121,11 +123,11 @@ class ResultFolder(Store[Experiment, Result]):
             ) from error
 
     def known(self, experiments: Sequence[Experiment]) -> dict[Experiment, Result]:
-        """Return the saved results; unreadable results and, without ``reuse``, results of other code are left out."""
+        """Return the saved results that can be used."""
         return {e: found for e in experiments if (found := self._kept(e)) is not None}
 
     def save(self, experiment: Experiment, outcome: Result) -> Result:
-        """Write one file, and return the result as it is read from the file."""
+        """Write the result to a file; read it from the file again, and return it."""
         return Result.load(outcome.save(self.folder))
 
     def _kept(self, experiment: Experiment) -> Result | None:
@@ -148,23 +150,22 @@ def run_all(
 ) -> list[Result]:
     """Run experiments in parallel, and return the results in the order of the experiments.
 
-    Each result is a separate file in ``folder/runs``, written as soon as the experiment is finished. If a result of the
-    same configuration and the same code was saved earlier, this result is read, and the experiment is not run again.
-    The measured values do not depend on ``workers``.
+    Each result is written to a separate file in ``folder/runs`` as soon as the experiment is finished. If the same code
+    has already saved a result of the same experiment, this result is read, and the experiment does not run again. The
+    measured values do not depend on ``workers``.
 
     Args:
         experiments: the experiments to run.
         folder: folder for results and recordings; created if missing.
         workers: processes that run the experiments; None: one for each processor.
         fresh: whether to ignore saved results and run all experiments again.
-        reuse: whether to use saved results of the same configuration even if another version of the code produced them;
-            each result names the version.
-        on_done: function called with the progress.
+        reuse: whether to use saved results that another version of the code produced. Each result names the version.
+        on_done: function that is called with the progress after each experiment.
 
     Raises:
         InputError: when the folder can't be written to, or the backend does not exist.
-        TaskFailedError: when a worker process ended unexpectedly; finished results are kept.
-        KeyboardInterrupt: after Ctrl-C; finished results are kept.
+        TaskFailedError: when a worker process ended unexpectedly; the results of finished experiments stay saved.
+        KeyboardInterrupt: after Ctrl-C; the results of finished experiments stay saved.
     """
     place = Path(folder)
     store = ResultFolder(place / _RUNS, reuse=reuse)

@@ -1,4 +1,4 @@
-"""Compare the method ``modern`` with every other method, and the claims of the thesis with the results."""
+"""Compare the method ``modern`` with every other method, and check the claims of the thesis against the results."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ COMPARED = (
     Figure("limit_violations", "frames beyond a limit", digits=0),
     *SMOOTHNESS,
 )
-"""The measures in which ``modern`` is compared with the other methods: all measures of accuracy, effort, torque and
-smoothness, and the number of frames that exceed a limit."""
+"""The measures in which ``modern`` is compared with the other methods in the recordings. These are all measures of
+accuracy, effort, torque and smoothness, and the number of frames that exceed a limit."""
 STACKED = Figure("success", "stacked [%]", 100.0, 0, more=True)
 LIVE_COMPARED = (STACKED, *LOOP, TORQUES[1], EFFORT[4], EFFORT[6])
-"""The measures that are compared in closed loop.
+"""The measures that are compared in the closed-loop trials.
 
 The success rate uses all trials; all other measures use only trials in which both methods succeeded.
 """
@@ -66,10 +66,10 @@ def comparison_table(results: Results, tasks: Sequence[str]) -> Table:
     ]
     columns = ("measure", f"{OURS} minus", "difference (95 %)>", "relative [%]>", "pairs>", "p, Holm>")
     note = (
-        "↑ marks measures for which a larger value is better. For all other measures, a smaller value is better. "
-        "Intervals are computed by resampling the persons. The p-value is computed by sign flips of the persons' "
-        "differences. Holm's method corrects it for the number of methods that are compared in each measure. Pairs: "
-        "recordings for which both methods have a value."
+        "↑ marks measures for which a larger value is better. For all other measures, a smaller value is better. The "
+        "intervals are bootstrap intervals over the persons. The p-value is that of a sign-flip test over the "
+        "persons. Holm's method corrects each p-value for the number of methods that are compared in the measure. "
+        "Pairs: recordings or trials for which both methods have a value."
     )
     return Table(f"Paired comparison: {', '.join(tasks)}", columns, tuple(rows), note)
 
@@ -94,9 +94,10 @@ def better_methods_table(results: Results, tasks: Sequence[str]) -> Table:
         "p, Holm>",
     )
     note = (
-        f"The table lists every measure whose interval shows that {OURS} is worse, even if p is large. The table also "
-        f"lists every method that had a higher success rate in stacking than {OURS}, even if the interval includes "
-        "zero. ↑ marks measures for which a larger value is better. For all other measures, a smaller value is better."
+        f"The table lists every measure in which the 95 % interval shows that {OURS} is worse, even if the p-value is "
+        f"large. It also lists every method that stacked the cubes more often than {OURS}, even if the interval "
+        "includes zero. ↑ marks measures for which a larger value is better. For all other measures, a smaller value "
+        "is better."
     )
     return Table(f"Where another method is better than {OURS}", columns, tuple(rows), note)
 
@@ -119,7 +120,8 @@ def _difference(comparison: Comparison, figure: Figure) -> tuple[str, str, str]:
 
 
 PRINTED_PATH = np.array([7.03, 7.43, 9.04, 9.26, 8.72, 9.53, 6.4, 8.36, 9.32, 10.24])
-"""Path length of Table 3.1, in the unit "cm.10" that the thesis prints but does not explain."""
+"""Path lengths of the ten experiments of thesis Table 3.1, in the unit "cm.10". The thesis does not explain this
+unit."""
 PRINTED_TORQUES = np.array(
     [
         [13.035, 13.58, 23.45, 18.42, 11.03, 20.45, 28.08],
@@ -134,19 +136,20 @@ PRINTED_TORQUES = np.array(
         [27.44, 12.3, 24.6, 24.08, 14.43, 17.12, 30.1],
     ]
 )
-"""Mean joint torque of the ten experiments of Table 3.1, shape (10, 7) [N m]."""
+"""Mean torque of each joint in the ten experiments of thesis Table 3.1, shape (10, 7) [N m]."""
 PRINTED_TIME = np.array([22.23, 18.43, 17.72, 19.2, 15.82, 14.21, 13.03, 9.01, 9.31, 12.42])
-"""Execution time of Table 3.1 [s]."""
+"""Execution times of the ten experiments of thesis Table 3.1 [s]."""
 
 ME = ("thesis", "modern")
-"""The two methods that stand for the thesis's method Me: ``thesis`` is Me with corrected equations."""
+"""The methods for which the claims about the thesis's method Me are checked. ``thesis`` is Me with corrected equations,
+and ``modern`` is the method of this library."""
 BASELINES = ("m1", "m2", "m3")
 _TORQUE_FIGURE = Figure("mean_torque", "mean torque [N m]", digits=2)
 _PATH_FIGURE = Figure("path_length", "path [m]", digits=2)
 
 
 def printed_table(results: Results, tasks: Sequence[str]) -> Table:
-    """Return a table with thesis Table 3.1 (means over its ten experiments) and our results (means over persons)."""
+    """Return a table of thesis Table 3.1 (means over its ten experiments) and of our results (means over persons)."""
     arm = ArmModel.load("sawyer", tool="gripper")
     rows = [
         (
@@ -168,10 +171,10 @@ def printed_table(results: Results, tasks: Sequence[str]) -> Table:
     columns = ("", *(f"τ{joint + 1} [N m]>" for joint in range(7)), "path>", "time [s]>")
     over = int(np.sum(PRINTED_TORQUES.mean(axis=0) > arm.max_torque))
     note = (
-        "Values are means (95 % interval). In the rows of the methods, torques and path are from the replayed "
-        f"recordings ({', '.join(tasks)}), and the time is from the closed-loop trials that succeeded. In the thesis, "
-        f"{over} of the 7 printed means are above the rated torques of the joints, so they can't be mean torques of a "
-        "Sawyer's joints."
+        "Values are means (95 % interval). In the rows of our methods, torques and path come from the recordings "
+        f"({', '.join(tasks)}). The time comes from the closed-loop trials that succeeded. In the thesis, {over} of "
+        "the 7 printed means exceed the rated torques of the joints, so they can't be mean torques of a Sawyer's "
+        "joints."
     )
     return Table("Table 3.1 of the thesis, and our values", columns, tuple(rows), note)
 
@@ -187,7 +190,7 @@ def _times(results: Results, method: str) -> Values:
 
 
 def claims_table(results: Results, tasks: Sequence[str]) -> Table:
-    """Return a table of the thesis's claims: whether they hold for the corrected thesis method and for ``modern``."""
+    """Return a table that shows whether the thesis's claims hold for the methods in :data:`ME`."""
     rows = []
     for claim, evaluate in CLAIMS:
         cells: list[str] = []
@@ -196,11 +199,11 @@ def claims_table(results: Results, tasks: Sequence[str]) -> Table:
         rows.append((claim, *cells))
     columns = ("the thesis claims", "thesis, corrected", "held?", "modern", "held?")
     note = (
-        "Each percentage is the difference of the column's method from the baseline, in paired trials. "
-        'The result is "yes" if, for every baseline, the 95 % interval of the difference is on the claimed side of '
-        'zero and the corrected p is below 0.05. The result is "no" if, for at least one baseline, the interval is on '
-        'the opposite side of zero. All other results are "not shown". Times are compared only for trials in which '
-        "the method and the baseline both succeeded."
+        "A percentage is the difference between the method of the column and the baseline, relative to the baseline. "
+        'A difference counts if its 95 % interval excludes zero and its corrected p-value is below 0.05. "Yes": for '
+        'every baseline, the difference counts and has the claimed sign. "No": for at least one baseline, the '
+        'difference counts and has the opposite sign. "Not shown": all other cases. Times are compared only in trials '
+        "in which the method and the baseline both succeeded."
     )
     return Table("Claims of the thesis, and results", columns, tuple(rows), note)
 
@@ -210,14 +213,14 @@ Verdict = tuple[str, str]
 
 
 def verdict(comparisons: Sequence[Comparison], sign: float) -> str:
-    """Return whether a claim holds in comparison with every baseline: "yes", "no" or "not shown".
+    """Return whether a claimed difference from every baseline is confirmed: "yes", "no" or "not shown".
 
     A difference counts if its interval excludes zero and its p-value, corrected for the number of baselines, is below
     0.05. With only two persons, p is never below 0.05, so no claim can be confirmed.
 
     Args:
-        comparisons: comparison of the evaluated method with each baseline (method minus baseline).
-        sign: claimed sign of the differences, -1 or 1.
+        comparisons: one comparison with each baseline (evaluated method minus baseline).
+        sign: sign that the differences should have according to the claim, -1 or 1.
     """
     corrected = holm([c.p for c in comparisons])
     shown = [
@@ -298,9 +301,9 @@ CLAIMS: Sequence[tuple[str, Callable[[Results, str, Sequence[str]], Verdict]]] =
     ("less torque than M1, M2, M3 (Fig 3.6)", _less("mean_torque")),
     ("a shorter path than M1, M2, M3, by up to 5 % (Fig 3.7)", _less("path_length")),
     ("shorter time than M1, M2, M3 (Fig 3.8)", _quicker),
-    ("M2 has the smallest torque, but takes longest (text beside Fig 3.7)", _two_leads),
+    ("M2 has the smallest torque, but takes the longest time (text beside Fig 3.7)", _two_leads),
     (
-        "at the edge of reach, singularities are avoided better than with M3",
+        "at the edge of reach, the arm stays farther from singularities than with M3",
         _farther_from_singular,
     ),
     (f"mean torques of {min(_MEANS):.0f} to {max(_MEANS):.0f} N m at every joint (Table 3.1)", _rated),

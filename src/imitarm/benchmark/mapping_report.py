@@ -1,4 +1,4 @@
-"""The results of the mapping benchmark as one self-contained HTML page: tables, figures, playback of person and robot.
+"""Write the results of the mapping benchmark as one HTML page with tables, figures, and playbacks of person and robot.
 
 The figures correspond to Figs 3.6 to 3.8 of the thesis. Each figure is one ``<svg>`` element.
 """
@@ -26,11 +26,11 @@ from imitarm.viewer.retarget_report import PLAYER_KEYS, MethodResult, RetargetRe
 
 _SHOWN: Final = 9.0  # [s] of the recording that is played
 _WORDS: Final = {
-    "Interval": "The 95 % confidence interval of a mean over persons, from resampling the persons. Overlapping "
-    "intervals do not rule out a difference; the table of paired comparisons tests for a difference.",
-    "Lag": "The constant delay that gives the best match between the path of the tool and the true path of the hand.",
-    "From first engagement": "The distance between the tool and its true target, from the time at which the robot "
-    "begins to follow until the end. This includes the time in which the robot does not follow the person.",
+    "Interval": "The 95 % confidence interval of a mean over persons (bootstrap over persons). Overlapping "
+    "intervals do not rule out a difference. The table of paired comparisons tests whether there is a difference.",
+    "Lag": "The constant delay of the tool after the hand that gives the best match between their motions.",
+    "From first engagement": "The RMS distance between the tool and its true target, from the time at which the robot "
+    "first follows the person until the end. Times in which the robot does not follow the person count as well.",
     "SPARC": "Spectral arc length of the speed: the closer to 0, the smoother the motion.",
     "Our interpretation": "The thesis describes its baselines only in words. The methods M1 to M3 "
     "are our implementations of these descriptions.",
@@ -47,7 +47,7 @@ def write_mapping_report(
         tables: tables that the command also prints.
         path: the file to write; its folder must exist.
         provenance: facts needed to repeat the benchmark.
-        folder: folder of the recordings; None if they were not saved.
+        folder: folder that contains the recordings; None if they were not saved.
 
     Returns:
         Absolute path of the page.
@@ -62,7 +62,7 @@ def write_mapping_report(
 def mapping_report_html(
     results: Results, tables: Sequence[Table], *, provenance: Mapping[str, Any], folder: Path | None
 ) -> str:
-    """Return the whole page; see :func:`write_mapping_report`."""
+    """Return the whole page as HTML; for the arguments, see :func:`write_mapping_report`."""
     shared, players = _players(results, folder)
     verdict, good = _verdict(results)
     summary = (
@@ -112,7 +112,7 @@ def _figures(results: Results) -> list[Figure]:
     tasks = results.tasks()
     stacking = results.tasks(["stacking"]) or tasks
     main = Results(r for r in results.all if r.experiment.method in MAIN)
-    bars = "Bars are means over persons, lines are 95 % intervals."
+    bars = "Bars: means over persons. Lines: 95 % intervals."
     return [
         Figure(successes(main), "Success", f"Four cubes stacked in closed loop. {bars}"),
         Figure(torques(main, stacking), "Mean torque of each joint (Fig 3.6)", bars),
@@ -184,7 +184,7 @@ def path_lengths(results: Results, tasks: Sequence[str], *, name: str = "paths")
 
 
 def accuracy(results: Results, tasks: Sequence[str], *, name: str = "accuracy") -> str:
-    """Draw the distance of the tool to its true target, for each method and kind of recording."""
+    """Draw the RMS distance between the tool and its true target, for each method and kind of recording."""
     text = "Root mean square distance of the tool to its true target"
     return _by_task(results, tasks, "tool_rms", 1e3, "tool RMS [mm]", text, name)
 

@@ -14,7 +14,7 @@ from imitarm.benchmark.tables import Table
 from imitarm.evaluation.intervals import Interval, Values, interval, rate_interval
 
 TEST = 200
-"""Number of the first test person; test persons are not used for developing methods."""
+"""Number of the first test person. Persons with smaller numbers were used for developing the methods."""
 _DEGREES = 180.0 / math.pi
 
 
@@ -24,10 +24,10 @@ class Figure:
 
     Attributes:
         name: name in ``Result.values``.
-        title: title of the table column, with the unit.
+        title: title of the table column, including the unit.
         factor: factor from SI units to the reported unit.
         digits: number of decimals.
-        more: whether a larger value is better.
+        more: True if a larger value is better; False if a smaller value is better.
     """
 
     name: str
@@ -74,40 +74,41 @@ LOOP = (Figure("time", "time [s]", digits=0), Figure("path_length", "path [m]", 
 _RECORDED = (Figure("recorded", "length [s]"), Figure("beyond_reach", "beyond reach [%]", 100.0))
 _MEANS_NOTE = "Each value is the mean over persons (95 % interval)."
 _ACCURACY_NOTE = (
-    "Distances are root mean squares. Executed: distance measured on a simulated arm that keeps its limits, as a real "
-    "arm does. Engaged: fraction of the time in which the robot followed the person."
+    "Distances are root mean squares. Executed: distance of a simulated arm that follows the commands within its "
+    "limits, as a real arm does. From first engagement: distance from the time at which the robot first follows the "
+    "person. Engaged: fraction of the time in which the robot followed the person."
 )
 _CAPTURED_NOTE = (
-    "All recordings show the motion of one person, so there is no interval: each value is the mean over the cameras "
-    "(smallest … largest)."
+    "Each value is the mean over the simulated cameras (smallest … largest). All recordings show the motion of one "
+    "person, so there is no interval."
 )
 _ONE = -1  # person of the captured arm: it is the same whichever simulated body carries it
 
 
 class Results:
-    """All results of a benchmark, with access by method, task and measure."""
+    """All results of a mapping benchmark, which can be selected by method, task and measure."""
 
     def __init__(self, results: Iterable[Result]) -> None:
         self.all = list(results)
         self.methods = [name for name in METHODS if any(r.experiment.method == name for r in self.all)]
 
     def of(self, method: str, tasks: Sequence[str]) -> list[Result]:
-        """Return the results of a method for some tasks."""
+        """Return the results of one method in the given tasks."""
         return [r for r in self.all if r.experiment.method == method and r.experiment.task in tasks]
 
     def tasks(self, among: Sequence[str] = KINDS) -> list[str]:
-        """Return the tasks that have results."""
+        """Return those of the given tasks that have results."""
         return [task for task in among if any(r.experiment.task == task for r in self.all)]
 
     def values(self, method: str, tasks: Sequence[str], name: str, joint: int | None = None) -> Values:
-        """Return one value of a measure for each recording, indexed by person and recording; nan where unknown.
+        """Return one value of a measure for each recording or trial; nan where the value is unknown.
 
         Args:
             method: name of the method.
             tasks: tasks whose results are included.
             name: name of the measure. ``"limit_violations"`` is the sum of three numbers: the frames that exceed a
-                limit of position, of velocity, and of acceleration. In closed loop, ``"success"`` is 1 or 0, and the
-                other measures are known only for successful trials.
+                limit of position, of velocity, and of acceleration. In closed-loop trials, ``"success"`` is 1 or 0. All
+                other measures of these trials are known only if the trial succeeded.
             joint: index of the joint, for measures with one value for each joint; None for the mean over the joints.
         """
         return {
@@ -135,7 +136,7 @@ def number(result: Result, name: str, joint: int | None = None) -> float:
 
 
 def written(found: Interval, figure: Figure) -> str:
-    """Return a table cell: mean, interval and, if values are missing, the number of recordings with a value."""
+    """Return a table cell with mean and interval. If values are missing, it also states the number of known values."""
     if not math.isfinite(found.mean):
         return f"– (0 of {found.of})" if found.of else "–"
     values = [figure.factor * v for v in (found.mean, found.low, found.high)]
@@ -146,7 +147,7 @@ def written(found: Interval, figure: Figure) -> str:
 
 
 def written_each(values: Values, figure: Figure) -> str:
-    """Return a table cell without interval: mean and, in brackets, smallest and largest value."""
+    """Return a table cell with the mean and, in brackets, the smallest and the largest value."""
     known = [figure.factor * value for _, value in sorted(values.items()) if math.isfinite(value)]
     if not known:
         return f"– (0 of {len(values)})" if values else "–"
@@ -165,7 +166,7 @@ def _cells(results: Results, name: str, task: str, figures: Sequence[Figure]) ->
 
 
 def recordings_table(results: Results) -> Table:
-    """Return a table of the recordings: number, duration, and how often the target is beyond the robot's reach."""
+    """Return a table of the recordings: number, duration, and how long the target is beyond the robot's reach."""
     rows = []
     for task in results.tasks(REPLAYS):
         runs = [r for r in results.all if r.experiment.task == task]
@@ -181,23 +182,28 @@ def recordings_table(results: Results) -> Table:
         rows.append((task, of, who, *cells))
     columns = ("kind", "recordings>", "persons", *(f"{figure.title}>" for figure in _RECORDED))
     note = (
-        "Beyond reach: fraction of the time in which the wrist's target is farther from the robot's shoulder than the "
-        f"robot's arm is long. A recording that could not be made is missing for every method. {persons_note(results)}"
+        "Beyond reach: fraction of the time in which the target of the robot's wrist is too far away for the arm. If "
+        f"a recording could not be made, it is missing for every method. {persons_note(results)}"
     )
     return Table("Recordings, the same for every method", columns, tuple(rows), note)
 
 
 def persons_note(results: Results) -> str:
-    """Return a sentence that names the simulated persons, and says whether methods were developed with them."""
+    """Return a sentence with the numbers of the simulated persons.
+
+    It says whether the methods were developed with them.
+    """
     seen = sorted({r.experiment.seed for r in results.all if r.experiment.task != CAPTURED})
     if not seen:
         return ""
     text = f"Persons {seen[0]} to {seen[-1]}." if len(seen) > 1 else f"Person {seen[0]}."
-    return text if seen[0] >= TEST else f"{text} Persons below {TEST} are for developing methods."
+    return (
+        text if seen[0] >= TEST else f"{text} Persons with numbers below {TEST} were used for developing the methods."
+    )
 
 
 def accuracy_table(results: Results, task: str) -> Table:
-    """Return a table of how well the methods follow the true arm in one kind of recording."""
+    """Return a table of how accurately each method follows the person's true motion in one kind of recording."""
     rows = []
     for name in results.methods:
         engaged = interval(results.values(name, [task], "engaged_fraction")).mean
@@ -209,12 +215,12 @@ def accuracy_table(results: Results, task: str) -> Table:
 
 
 def effort_table(results: Results, tasks: Sequence[str]) -> Table:
-    """Return a table of path length, settling time and torque."""
+    """Return a table of the times, the path length and the torques of each method."""
     return _figures(results, tasks, EFFORT, "Times, path, torques")
 
 
 def smoothness_table(results: Results, tasks: Sequence[str]) -> Table:
-    """Return a table of jerk, spectral arc length and distance from singularity."""
+    """Return a table of the jerk, the spectral arc length and the smallest singular value of the Jacobian."""
     return _figures(results, tasks, SMOOTHNESS, "Smoothness and singularity")
 
 
@@ -260,15 +266,15 @@ def limits_table(results: Results, tasks: Sequence[str]) -> Table:
     heads = ("method", "recordings without any>", "position>", "velocity>", "acceleration>")
     columns = (*heads, "worst velocity>", "worst acceleration>", "faults found by the method>")
     note = (
-        "Position, velocity, acceleration: number of frames that exceed the limit. Worst velocity, worst acceleration: "
-        "largest value divided by the limit. Found by the method: number of faults that the method itself found and "
-        "did not fix."
+        "Position, velocity, acceleration: number of frames in which a joint exceeds this limit. Worst velocity, "
+        "worst acceleration: largest value divided by the limit. Faults found by the method: number of faults that "
+        "the method itself reported and did not correct."
     )
     return Table(f"Limit violations: {', '.join(tasks)}", columns, tuple(rows), note)
 
 
 def success_table(results: Results) -> Table:
-    """Return a table on stacking in closed loop: success rate, and time and path length of the successful trials."""
+    """Return a table of the closed-loop trials: success rate, and means over the successful trials."""
     rows = []
     for name in results.methods:
         runs = results.of(name, [LIVE])
@@ -285,10 +291,9 @@ def success_table(results: Results) -> Table:
         rows.append((METHODS[name].title, *rate, *cells, why))
     columns = ("method", "stacked>", "95 % [%]>", *(f"{figure.title}>" for figure in LOOP), "failures")
     note = (
-        "The interval of the success rate is Wilson's, with an effective number of trials. The more the persons "
-        "differ, the smaller is the effective number of trials. One more failure never raises the lower end of the "
-        "interval. Time, path and torque are means over persons (95 % interval) and include only the trials that "
-        "succeeded. "
+        "The interval of the success rate is a Wilson interval, with an effective number of trials. This number is "
+        "smaller if the results differ more between persons. One more failure never raises the lower end of the "
+        "interval. Time, path and torque are means over persons (95 % interval) in successful trials. "
         f"{persons_note(results)}"
     )
     return Table("Four cubes stacked, closed loop", columns, tuple(rows), note)

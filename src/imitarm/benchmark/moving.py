@@ -1,7 +1,7 @@
-"""The avoidance benchmark among moving obstacles: one experiment is one method in one scene, with one sensor.
+"""The benchmark of avoidance among moving obstacles: an experiment tests one method in one scene with one sensor.
 
-``MovingExperiment("M1", 3, 2000, "rcamo").run()`` makes the scene, lets the method move the tool among obstacles that a
-tracker reports, and measures the motion against the true obstacles.
+``MovingExperiment("M1", 3, 2000, "rcamo").run()`` makes a scene of family M1 and runs the method ``rcamo`` in this
+scene. The method knows the obstacles only from a tracker. The benchmark measures the motion with the true obstacles.
 """
 
 from __future__ import annotations
@@ -31,27 +31,27 @@ Options = tuple[tuple[str, float | str], ...]
 OURS = ("rcamo", "rcamo-certified")
 """Our methods."""
 WORLDS = ("tool", *ROBOTS)
-"""The worlds in which a method can be tested: the tool alone, and two simulated arms."""
+"""The worlds in which a method can be tested: a tool that moves without an arm, and two simulated arms."""
 _PLAN_JOINTS = ("rrt-connect", "rrt-connect-tilt", "rcamo-certified")  # these need an arm
 _PLAN_ONCE = ("elastic-band", "tp-gmm")  # the first plans once; the second differs from gmm-dmp at other ends only
 
 
 def method_names(world: str = "tool") -> tuple[str, ...]:
-    """Return the names of all methods in a world: the controls, and the policies that can run in this world."""
+    """Return the names of all methods that can run in a world: controls and policies."""
     if world == "tool":
         return (*CONTROLS, *(name for name in POLICIES if name not in _PLAN_JOINTS))
     return (CONTROLS[0], *ORACLES, *POLICIES)
 
 
 def default_methods(world: str = "tool") -> tuple[str, ...]:
-    """Return the methods that are compared by default."""
+    """Return the names of the methods that the command compares by default."""
     if world != "tool":
         return (CONTROLS[0], *OURS, "acfra", "dmp-potential", "barrier", "modulation")
     return tuple(name for name in method_names() if name not in _PLAN_ONCE)
 
 
 def build(method: str, case: MovingCase, options: Options = (), world: str = "tool") -> Policy:
-    """Return the policy of a method for a scene; in a world with an arm, the policy may also plan the joint motion.
+    """Return the policy of a method for a scene.
 
     Raises:
         UnknownNameError: when there is no such method.
@@ -77,20 +77,22 @@ def build(method: str, case: MovingCase, options: Options = (), world: str = "to
 
 @dataclass(frozen=True)
 class MovingExperiment:
-    """One method in one scene with one sensor. All values are plain, so another process or machine can run it.
+    """The definition of one run: one method in one scene with one sensor.
+
+    Another process or machine can run it, because it contains only text and numbers.
 
     Attributes:
         family: one of :data:`~imitarm.benchmark.moving_scenes.FAMILIES`.
-        dimension: 2 when the path may only be displaced horizontally, else 3.
-        seed: number of the scene, and of the sensor's errors.
+        dimension: 2 if the method may displace the path only horizontally; 3 if every direction is allowed.
+        seed: seed of the scene and of the sensor's errors.
         method: one of :func:`method_names`.
-        options: options that replace the defaults of the method.
+        options: names and values of options that replace the defaults of the method.
         world: one of :data:`WORLDS`. A world with an arm needs ``dimension`` 3.
         noise: standard deviation of a measured position (:class:`~imitarm.control_loop.SensorModel`) [m].
         rate: rate of the sensor [Hz].
-        latency: delay of the sensor [s].
-        dropout: probability that an obstacle is missed in a frame.
-        occlusions: rate of occlusions [1/s].
+        latency: time from a measurement until the tracker receives it [s].
+        dropout: probability that the sensor misses an obstacle in a frame.
+        occlusions: mean number of occlusions of an obstacle per second [1/s].
         observer: one of :data:`~imitarm.benchmark.moving_arm.OBSERVERS`. A camera needs a world with an arm; the five
             numbers of the sensor must then have their default values, because the camera has its own noise and rate.
 
@@ -156,7 +158,7 @@ class MovingExperiment:
         return moving_case(self.family, self.dimension, self.seed)
 
     def moved(self) -> tuple[MovingCase, ToolRun]:
-        """Return the scene, and the motion of the tool without an arm, for measuring and drawing."""
+        """Run the method with a tool without an arm; return the scene and the motion."""
         case = self.case()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of numerical methods in hard scenes: the motion is measured anyway
@@ -164,7 +166,7 @@ class MovingExperiment:
             return case, run_tool(build(self.method, case, self.options), case, observe)
 
     def run(self) -> MovingResult:
-        """Let the method move the tool in its scene, and measure the motion.
+        """Run the method in its scene, and measure the motion.
 
         Returns:
             The result. If the method raises an error, the outcome is "failed", and the reason contains the error.
@@ -194,8 +196,9 @@ class MovingResult:
         code: version of the code that ran, see :func:`~imitarm.benchmark.provenance.code_version`.
         outcome: one of :data:`~imitarm.benchmark.moving_measures.OUTCOMES`.
         reason: explanation of the outcome; empty after a success.
-        values: measures by name, see :func:`~imitarm.benchmark.moving_measures.measured`; ``n_obstacles``; ``touched``,
-            the time at which the tool of the learned motion touches an obstacle [s].
+        values: measures by name, see :func:`~imitarm.benchmark.moving_measures.measured`. Two further values are
+            ``n_obstacles``, and ``touched``, the time at which the learned motion without avoidance touches an obstacle
+            [s].
     """
 
     experiment: MovingExperiment
@@ -210,7 +213,7 @@ class MovingResult:
 
     @property
     def success(self) -> bool:
-        """Whether nothing was touched and the goal was reached in time."""
+        """Whether the tool (or arm) touched nothing and reached the goal in time."""
         return self.outcome in SUCCESSES
 
     def value(self, name: str) -> float:

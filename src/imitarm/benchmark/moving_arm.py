@@ -1,4 +1,4 @@
-"""The world of the moving benchmark with a whole arm: a simulated robot, its safety filter, and a sensor."""
+"""The world of the moving benchmark with a whole arm: a simulated robot with a safety filter and a sensor."""
 
 from __future__ import annotations
 
@@ -60,11 +60,11 @@ def arm_case(robot: str, family: str, seed: int) -> MovingCase:
     """Return a scene around the path of the skill 'sweep'.
 
     No obstacle overlaps the arm at the start, or its tool at the goal. No obstacle comes near the fixed base of the arm
-    during the run, because the base can't evade. If the scene of a seed breaks these rules, the seed is replaced by a
-    seed that is 10 000 larger.
+    during the run, because the base can't evade an obstacle. If the scene of a seed breaks these rules, the scene of a
+    seed that is 10 000 larger replaces it.
 
     Raises:
-        InputError: when no scene is found.
+        InputError: when none of 20 seeds gives a scene that keeps these rules.
     """
     skill, arm, start = prepared(robot)
     centers, radii = arm.collision_spheres(start)
@@ -76,7 +76,10 @@ def arm_case(robot: str, family: str, seed: int) -> MovingCase:
         late = _least_gap(case, skill.duration_ * np.linspace(1.0, LONGEST, 15), tool, arm.tool_spheres[:, 3])
         if min(early, late) > case.clearance + _SPARE and _leaves_base_free(case, arm):
             return case
-    raise InputError(f"{family}, seed {seed}: no scene leaves the {robot} free at the start")
+    raise InputError(
+        f"{family}, seed {seed}: in every scene that was tried, an obstacle is too near to the {robot}; "
+        "choose another seed"
+    )
 
 
 def _leaves_base_free(case: MovingCase, arm: ArmModel) -> bool:
@@ -130,10 +133,10 @@ class _Timed(Policy):
 def run_arm(
     policy: Policy, case: MovingCase, robot: str, sensor: SensorModel, observer: str = OBSERVERS[0]
 ) -> tuple[str, str, dict[str, Any]]:
-    """Let a policy move an arm in a scene; return the outcome, its explanation, and the measures.
+    """Run a policy with an arm in a scene; return the outcome, its explanation, and the measures.
 
-    The measures are those of a tool without an arm, but the simulator measures clearance and contacts of the whole arm.
-    The safety filter requires the clearance of all links.
+    The measures are the same as for a tool without an arm, with one difference: clearance and contacts are those of the
+    whole arm, measured by the simulator. The safety filter keeps the required clearance for all links.
 
     Args:
         policy: the policy.

@@ -1,14 +1,16 @@
-"""Controls of the moving benchmark: methods whose results show that the benchmark measures what it should.
+"""Controls of the moving benchmark: methods with a known result show whether the benchmark measures correctly.
 
-* ``no-avoidance`` follows the learned motion. If it succeeded, the scenes would test nothing.
-* ``aims-at-obstacle`` steers to the middle of the nearest tracked obstacle. If it ever succeeded, the measures would be
-  wrong.
-* ``oracle-future`` knows the true motion of the obstacles. A scene that this oracle does not solve may have no
-  solution.
-* ``oracle-tracks`` knows only the tracked obstacles, as the methods do (:class:`CausalOracle`). A contact that this
-  oracle avoids was avoidable.
+* ``no-avoidance`` follows the learned motion. If this method succeeded, the obstacles would not block the learned
+  motion.
+* ``aims-at-obstacle`` steers to the middle of the nearest tracked obstacle. If this method ever succeeded, the
+  benchmark would measure contacts wrongly.
+* ``oracle-future`` knows the true future motion of the obstacles. If this oracle does not solve a scene, the scene may
+  have no solution.
+* ``oracle-tracks`` knows only the tracked obstacles, like the compared methods (:class:`CausalOracle`). If this oracle
+  avoids a contact, the contact was avoidable.
 
-``oracle-future`` searches space and time (:func:`search`). The oracles share no code with the compared methods.
+``oracle-future`` searches for a motion in space and time (:func:`search`). The oracles do not use the code of the
+compared methods.
 """
 
 from __future__ import annotations
@@ -36,11 +38,11 @@ from imitarm.trajectory import Trajectory
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Gap = Callable[[Array, float], Array]
-"""Type of a function of points (n, 3) [m] and a time [s]. The function returns, for a tool at each of the points, the
-gap to the nearest obstacle at that time, shape (n,) [m]."""
+"""Type of a function of points, shape (n, 3) [m], and a time [s]. The function returns the gap between a tool at each
+point and the nearest obstacle at this time, shape (n,) [m]."""
 
 LAYER = 0.05
-"""Time between two layers of the search [s]; a layer is the grid of cells at one instant."""
+"""Time between two layers of the search [s]. A layer contains all cells of the grid at one instant."""
 _CELL = {2: 0.02, 3: 0.03}  # [m]
 _BESIDE = {2: 0.30, 3: 0.24}  # [m] the grid reaches so far beyond the learned path
 _REACH = 2  # cells that the tool may move between two layers
@@ -66,13 +68,13 @@ _AHEAD = 0.97  # of the longest duration, for the arrival
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """The grid of cells around a learned path in which the oracles search.
+    """The grid of cells around a learned path in which ``oracle-future`` searches.
 
     Attributes:
         points: centres of the cells, shape (n, 3) [m].
         shape: number of cells along each axis.
         cell: width of a cell [m].
-        low: centre of the first cell, shape (3,) [m].
+        low: centre of the cell with the smallest coordinates, shape (3,) [m].
     """
 
     points: Array
@@ -82,7 +84,7 @@ class Grid:
 
     @classmethod
     def around(cls, path: Array, *, planar: bool) -> Grid:
-        """Return the grid around a path (n, 3) [m]; in a plane, it has one layer of cells in height."""
+        """Return the grid around a path, shape (n, 3) [m]. If ``planar`` is True, all cells have the same height z."""
         d = 2 if planar else 3
         cell, beside = _CELL[d], np.array([_BESIDE[d], _BESIDE[d], 0.0 if planar else _BESIDE[d]])
         low = path.min(axis=0) - beside
@@ -98,7 +100,10 @@ class Grid:
         return int(i[0]), int(i[1]), int(i[2])
 
     def moves(self) -> list[tuple[int, int, int]]:
-        """Return the allowed moves from one layer to the next, in cells; the first move is to stay in the same cell."""
+        """Return the allowed moves from one layer of time to the next, as numbers of cells.
+
+        The first move is (0, 0, 0).
+        """
         x, y, z = (range(-min(_REACH, n - 1), min(_REACH, n - 1) + 1) for n in self.shape)
         found = [m for m in itertools.product(x, y, z) if sum(i * i for i in m) <= _REACH**2]
         return sorted(found, key=lambda m: sum(i * i for i in m))
@@ -107,19 +112,20 @@ class Grid:
 def search(
     grid: Grid, start: Array, nominal: Trajectory, gap: Gap, *, begin: float, end: float, margin: float
 ) -> Trajectory | None:
-    """Return the motion of least cost from ``start`` to the goal, or None if there is no such motion.
+    """Return the motion of least cost from ``start`` to the goal; None if the goal cannot be reached.
 
-    From one layer to the next, the tool may stay or move to a near cell. A cell is free in a layer if the tool in this
-    cell keeps ``margin`` from every obstacle at this instant. Dynamic programming finds the chain of free cells with
-    the least sum of squared distances from the learned motion.
+    From one layer of time to the next, the tool may stay or move to a near cell. A cell is free in a layer if a tool in
+    this cell keeps ``margin`` from every obstacle at this instant. Dynamic programming finds the cheapest sequence of
+    free cells. The cost is the sum of the squared distances from the learned motion and of the squared lengths of the
+    moves.
 
     Args:
         grid: the cells.
         start: position at the time ``begin``, shape (3,) [m].
         nominal: the learned motion from time 0.
-        gap: function that returns the gap between the tool and the nearest obstacle, see :data:`Gap`.
+        gap: function that returns the gap between tool and obstacles, see :data:`Gap`.
         begin: time of the first layer [s].
-        end: latest time of arrival [s].
+        end: latest time at which the tool may arrive at the goal [s].
         margin: smallest gap of a free cell [m].
     """
     times = np.arange(begin, end + 1e-9, LAYER)
@@ -154,14 +160,14 @@ def search(
 
 
 def _slices(move: tuple[int, int, int], shape: tuple[int, int, int]) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
-    """Return the cells that are reached by a move, and the cells from which it leads there."""
+    """Return the cells that a move can reach, and for each of them the cell from which the move starts."""
     here = tuple(slice(max(m, 0), n + min(m, 0)) for m, n in zip(move, shape, strict=True))
     there = tuple(slice(max(-m, 0), n + min(-m, 0)) for m, n in zip(move, shape, strict=True))
     return here, there
 
 
 def _smoothed(times: Array, path: Array, goal: Array) -> Trajectory:
-    """Return a smooth motion along a chain of cells, which ends at the goal."""
+    """Return a smooth motion along a sequence of positions, which ends at the goal."""
     arrived = len(path) - 1
     while arrived > 1 and np.allclose(path[arrived - 1], path[-1]):
         arrived -= 1
@@ -200,16 +206,16 @@ class AimsAtNearest(Policy):
         return Command(np.concatenate([velocity, np.zeros(3)]))
 
     def finished(self, observation: Observation) -> bool:
-        """Return whether the tool happens to be at the goal at the end of the learned duration."""
+        """Return whether the learned duration has passed and the tool is at the goal."""
         away = np.linalg.norm(observation.tool_to_base.position - self.skill.goal_.position)
         return bool(observation.time - self._began >= self.skill.duration_ and away < _ARRIVED)
 
 
 class Oracle(Policy):
-    """Follow the motion that the search finds with the true future.
+    """Follow the motion that :func:`search` finds with the true future motion of the obstacles.
 
     Args:
-        case: the scene, with the true future.
+        case: the scene, which contains the true motion of the obstacles.
         options: arguments of :class:`~imitarm.policies.Policy`.
     """
 
@@ -222,7 +228,7 @@ class Oracle(Policy):
         self._grid = Grid.around(self._nominal.positions, planar=case.dimension == 2)
 
     def reset(self, observation: Observation) -> None:
-        """Search.
+        """Search for a motion from start to goal.
 
         Raises:
             InfeasibleError: when no motion is found.
@@ -244,12 +250,12 @@ class Oracle(Policy):
         raise InfeasibleError("the search finds no motion")
 
     def step(self, observation: Observation, dt: float) -> Command:
-        """Return the velocity that follows the motion."""
+        """Return the velocity with which the tool follows the motion."""
         del dt
         return _follow(self._motion, observation.time, observation.tool_to_base.position)
 
     def finished(self, observation: Observation) -> bool:
-        """Return whether the tool is at the goal at the end of the motion."""
+        """Return whether the motion, or the learned duration, has ended and the tool is at the goal."""
         away = np.linalg.norm(observation.tool_to_base.position - self._nominal.positions[-1])
         late = min(self._motion.times[-1], self.case.skill.duration_)
         return bool(observation.time >= late and away < _ARRIVED)
@@ -262,12 +268,14 @@ class Oracle(Policy):
 
 
 class Cells(NamedTuple):
-    """The grid of deviations from the learned motion.
+    """The grid of displacements from the learned motion in which ``oracle-tracks`` searches.
 
     Attributes:
-        deviations: shape (n, 3) [m]; the middle one is 0.
-        before: cells from which each cell can be reached in one layer, shape (n, k); n for cells outside the grid.
-        lengths: squared lengths of these steps, shape (k,) [m^2].
+        deviations: displacement of each cell from the learned motion, shape (n, 3) [m]; the displacement of the middle
+            cell is 0.
+        before: indices of the cells from which a move leads to each cell, shape (n, k). The index n stands for a cell
+            outside the grid.
+        lengths: squared length of each of the k moves, shape (k,) [m^2].
     """
 
     deviations: Array
@@ -277,7 +285,7 @@ class Cells(NamedTuple):
 
 @lru_cache(maxsize=2)
 def cells(dimension: int) -> Cells:
-    """Return the grid, in the horizontal plane or in space."""
+    """Return the grid: in the horizontal plane for dimension 2, in space for dimension 3."""
     half, reach, cell = _BESIDE_IT[dimension], _STEPS[dimension], _APART[dimension]
     spans = [range(-half, half + 1)] * dimension + [range(1)] * (3 - dimension)
     grid = np.array(list(itertools.product(*spans)))
@@ -294,11 +302,12 @@ def cells(dimension: int) -> Cells:
 
 
 def cheapest(costs: Array, begin: int, grid: Cells) -> Indices:
-    """Return the chain of cells with the least sum of costs and steps, one cell for each layer.
+    """Return the cheapest sequence of cells, one cell for each layer of time, as indices of shape (L,).
 
     Args:
-        costs: cost of each cell in each layer, shape (L, n).
-        begin: cell in the first layer.
+        costs: cost of each cell in each of the L layers, shape (L, n). The squared lengths of the moves are added to
+            these costs.
+        begin: index of the cell in the first layer.
         grid: the cells.
     """
     n = len(grid.deviations)
@@ -318,11 +327,11 @@ def cheapest(costs: Array, begin: int, grid: Cells) -> Indices:
 
 
 class CausalOracle(Policy):
-    """Follow the motion that a search in space and time finds among the tracked obstacles, ten times a second.
+    """Search for a motion among the tracked obstacles ten times per second, and follow the latest motion.
 
-    The search covers 0.9 s. A state is a deviation from the learned motion, on a grid. The cost of a state is its
-    squared distance from the learned motion, plus a cost where the predicted gap to an obstacle is less than wanted.
-    Dynamic programming finds the chain of states of least cost.
+    The search covers the next 0.9 s. Each cell of a grid is a displacement from the learned motion. A cell costs the
+    square of its displacement. If the predicted gap to an obstacle is too small, the cell costs more. Dynamic
+    programming finds the cheapest sequence of cells.
 
     Args:
         case: the scene; only its skill and its dimension are used.
@@ -342,7 +351,7 @@ class CausalOracle(Policy):
         self._before = observation.time, observation.tool_to_base.position
 
     def step(self, observation: Observation, dt: float) -> Command:
-        """Return the velocity that follows the motion found last."""
+        """Return the velocity with which the tool follows the latest motion."""
         del dt
         time, x = observation.time, observation.tool_to_base.position
         if time - self._searched >= _AGAIN - 1e-9:
@@ -354,7 +363,7 @@ class CausalOracle(Policy):
         return _follow(self._motion, time, x)
 
     def finished(self, observation: Observation) -> bool:
-        """Return whether the tool is at the goal after the learned duration."""
+        """Return whether the learned duration has passed and the tool is at the goal."""
         away = np.linalg.norm(observation.tool_to_base.position - self._nominal.positions[-1])
         return bool(observation.time >= self._nominal.times[-1] and away < _ARRIVED)
 
@@ -387,18 +396,18 @@ def _clock(duration: float) -> Array:
 
 
 def _follow(motion: Trajectory, time: float, x: Array) -> Command:
-    """Return the command that follows a motion at its own times."""
+    """Return the command with which a tool at ``x`` follows a motion at the given time."""
     at = motion.at(np.clip([time, time + 0.01], motion.times[0], motion.times[-1]))[0]
     velocity = (at[1] - at[0]) / 0.01 + _GAIN * (at[0] - x)
     return Command(np.concatenate([velocity, np.zeros(3)]))
 
 
 CONTROLS = ("no-avoidance", "aims-at-obstacle", "oracle-future", "oracle-tracks")
-"""The controls by name."""
+"""The names of the controls."""
 
 
 def control(name: str, case: MovingCase, **options: Any) -> Policy:
-    """Return a control for a scene.
+    """Return the policy of a control for a scene.
 
     Args:
         name: one of :data:`CONTROLS`.

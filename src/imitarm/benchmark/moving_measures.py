@@ -1,4 +1,4 @@
-"""Measures of a motion of the tool among moving obstacles, computed from the true obstacles, not by the methods."""
+"""Measure a motion of the tool among moving obstacles, with the true positions of the obstacles."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from imitarm.trajectory import Trajectory
 Array = NDArray[np.float64]
 
 PER_PERIOD = 2
-"""Number of instants in each control period at which the true distance is computed."""
+"""Number of instants per control period at which the true distance to the obstacles is computed."""
 OUTCOMES = ("success", "too near", "contact", "missed goal", "late", "refused", "failed")
-"""Possible outcomes: "success"; "too near" (a success, but nearer to an obstacle than required); "contact"; "missed
-goal" (the policy ended the motion elsewhere); "late" (not arrived after twice the learned duration); "refused" (before
-any motion); "failed" (the method raised an error)."""
+"""Possible outcomes. "success": the tool touched nothing and reached the goal. "too near": the same, but the tool came
+nearer to an obstacle than required. "contact": the tool touched an obstacle. "missed goal": the policy ended the motion
+elsewhere. "late": the tool had not arrived after twice the learned duration. "refused": the policy refused the task
+before any motion. "failed": the method raised an error."""
 SUCCESSES = OUTCOMES[:2]
-"""Outcomes that count as a success: the tool touched nothing, and reached the goal in time. The simulation itself keeps
-the tool within its limits of speed and acceleration."""
+"""Outcomes that count as a success. The simulation itself limits the speed and the acceleration of the tool."""
 _STALLED = 0.02  # [m/s] a tool slower than this stands
 _TRACKED = 0.15  # [m] a track farther than this from an obstacle belongs to something else
 _LOOKS = 0.10  # [s] before a contact, at which its cause is determined
@@ -42,10 +42,11 @@ class Contact:
     Attributes:
         obstacle: name of the obstacle.
         time: time at which the contact begins [s].
-        obstacle_speed: speed of the obstacle's surface towards the tool [m/s].
-        tool_speed: speed of the tool towards the obstacle [m/s]; negative when the tool moves away from the obstacle.
+        obstacle_speed: speed at which the obstacle's surface approaches the tool [m/s].
+        tool_speed: speed at which the tool approaches the obstacle [m/s]; negative if the tool moves away from the
+            obstacle.
         braking: whether the tool stands, or brakes with at least half of its largest deceleration.
-        status: status of the policy's command.
+        status: status of the policy's command at the contact.
         cause: explanation, see :func:`contacts`.
     """
 
@@ -69,19 +70,22 @@ def measured(case: MovingCase, run: ToolRun) -> tuple[str, str, dict[str, Any]]:
         * ``duration``, ``duration_ratio``: duration of the motion [s], and this duration divided by the learned
           duration;
         * ``rmse``: root mean square distance between the motion and the learned motion at equal times [m]; after the
-          end of the learned motion, the distance to the goal counts;
+          end of the learned motion, the distance from the goal is used;
         * ``rmse_unaffected``: like ``rmse``, but only over the samples at which the tool on the learned path is farther
           than 10 cm from every obstacle [m];
-        * ``path_rmse``: root mean square distance to the nearest point of the learned path, whatever the timing [m];
-        * ``stall``: longest time for which the tool stands before it arrives [s];
+        * ``path_rmse``: root mean square distance from the nearest point of the learned path [m], so delays do not
+          count;
+        * ``stall``: longest time for which the tool stands between start and goal [s];
         * ``length_ratio``: path length divided by the length of the learned path;
         * ``sparc``, ``ldlj``: smoothness, as spectral arc length and as logarithmic dimensionless jerk;
         * ``max_speed``, ``max_acceleration``: largest speed and acceleration of the tool [m/s], [m/s^2];
-        * ``step_median``, ``step_p99``, ``reset_seconds``: computing time of the policy [s];
-        * ``position_error``, ``velocity_error``: root mean square errors of the tracks at the current time [m], [m/s];
-        * ``nees``: mean normalised squared error of the tracked positions, 3 if the covariance is right;
+        * ``step_median``, ``step_p99``: computing time of a step, median and 99th percentile [s]; ``reset_seconds``:
+          computing time of the reset [s];
+        * ``position_error``, ``velocity_error``: root mean square errors of the tracked obstacles [m], [m/s];
+        * ``nees``: mean squared error of the tracked positions, normalised by their covariance; 3 if the covariance is
+          right;
         * ``switches``: number of times the track number of an obstacle changes;
-        * ``unseen``: fraction of the time in which an obstacle has no track;
+        * ``unseen``: fraction of the time in which an obstacle has no track, over all obstacles;
         * ``contacts``: list of :class:`Contact` as dictionaries.
     """
     values: dict[str, Any] = {"step_median": math.nan, "step_p99": math.nan, "reset_seconds": run.reset_seconds}
@@ -109,7 +113,7 @@ def _outcome(case: MovingCase, run: ToolRun, values: dict[str, Any], touched: li
         why = f": {run.last.reason}" if run.last.reason else ""
         return "late", f"{1e3 * error:.0f} mm from the goal after {LATEST:g} times the learned duration{why}"
     if error > AT_GOAL:
-        return "missed goal", f"the motion ends {1e3 * error:.1f} mm from the goal"
+        return "missed goal", f"the policy ends the motion {1e3 * error:.1f} mm from the goal"
     if values["clearance"] < case.clearance - SLACK:
         return "too near", f"{1e3 * values['clearance']:.1f} mm instead of {1e3 * case.clearance:.0f} mm"
     return "success", ""
@@ -123,7 +127,10 @@ def _dense(run: ToolRun) -> tuple[Array, Array]:
 
 
 def motion_measures(case: MovingCase, run: ToolRun, times: Array, gap: Array) -> dict[str, float]:
-    """Return the measures of the motion, see :func:`measured`; ``gap`` (n_obstacles, n) [m] is the gap at ``times``."""
+    """Return the measures of the motion, see :func:`measured`.
+
+    ``gap`` is the gap between the tool and each obstacle at ``times``, shape (n_obstacles, n) [m].
+    """
     skill = case.skill
     goal, T = skill.goal_.position, skill.duration_
     nominal = skill.nominal(np.linspace(0.0, T, 400))
@@ -156,7 +163,7 @@ def motion_measures(case: MovingCase, run: ToolRun, times: Array, gap: Array) ->
 
 
 def _longest_stall(run: ToolRun, speed: Array, goal: Array) -> float:
-    """Return the longest time for which the tool stands, after its start and away from the goal [s]."""
+    """Return the longest time for which the tool stands between its start and its arrival at the goal [s]."""
     stands = speed < _STALLED
     started = np.flatnonzero(~stands)
     if not len(started):
@@ -169,15 +176,15 @@ def _longest_stall(run: ToolRun, speed: Array, goal: Array) -> float:
 
 
 def contacts(case: MovingCase, run: ToolRun, times: Array, points: Array, gap: Array) -> list[Contact]:
-    """Return the first contact with each obstacle, each with its cause.
+    """Return the first contact with each obstacle, and its cause.
 
-    The first cause in this list whose condition is true is chosen:
+    The cause is the first entry of this list that is true:
 
     * "not tracked": the obstacle had no track 0.1 s before the contact;
     * "wrong track": 0.1 s before the contact, the track was more than 3 cm away from the obstacle;
-    * "the obstacle moves into the tool": the tool stands, or moves away from the obstacle;
+    * "the obstacle moves into the tool": the tool stands or moves away from the obstacle;
     * "braked too late": the tool brakes;
-    * "the tool moves into the obstacle": none of the other conditions is true.
+    * "the tool moves into the obstacle": all other cases.
     """
     found = []
     scene = case.truth.scene
@@ -219,10 +226,10 @@ def _cause(case: MovingCase, seen: list[Seen], i: int, time: float, towards: flo
 
 
 def tracking(case: MovingCase, seen: list[Seen]) -> dict[str, float]:
-    """Return the errors of the observed obstacles, see :func:`measured`.
+    """Return the errors of the tracked obstacles, see :func:`measured`.
 
-    The track of an obstacle is the track nearest to it, if that track is within 15 cm. Obstacles out of the sensor's
-    reach are left out.
+    The nearest track within 15 cm of an obstacle counts as the track of this obstacle. Obstacles more than 5 m away are
+    left out.
     """
     squares, speeds, nees, missing, switches, total = [], [], [], 0, 0, 0
     last: dict[int, int] = {}
@@ -261,7 +268,7 @@ def _rms(values: Array) -> float:
 
 
 def limits_kept(values: dict[str, Any]) -> bool:
-    """Return whether speed and acceleration of the tool were within their limits."""
+    """Return whether the tool kept its limits of speed and acceleration."""
     fast, sudden = values.get("max_speed", 0.0), values.get("max_acceleration", 0.0)
     return bool(fast <= MAX_SPEED * (1.0 + 1e-9) and sudden <= MAX_ACCELERATION * (1.0 + 1e-6))
 

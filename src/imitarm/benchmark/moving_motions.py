@@ -1,4 +1,7 @@
-"""Motions of obstacles in the moving benchmark, as functions of time; each passes its meeting point at a given time."""
+"""Motions of obstacles in the moving benchmark.
+
+At a given time, each obstacle is at a point where it meets the tool.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +17,9 @@ from imitarm.scene.motion import Motion, Track
 Array = NDArray[np.float64]
 
 AWAY = np.array([0.0, 0.0, -50.0])
-"""Position of an obstacle before it appears, shape (3,) [m]; it is out of the reach of every sensor."""
+"""Position of an obstacle before it appears, shape (3,) [m]; no sensor sees an obstacle there."""
 BEFORE = 2.0
-"""Every motion of an obstacle begins this long before time 0 [s]."""
+"""Time before the start of the tool's motion (time 0) at which the motion of every obstacle begins [s]."""
 _MOVES, _RESTS = (0.4, 0.9), (0.3, 0.8)  # [s] of an obstacle that stops and goes on
 _RAMP = 10  # samples over which its speed changes
 _STEP = 0.01  # [s]
@@ -31,7 +34,7 @@ def straight(obstacle: Obstacle) -> Motion:
 
 
 def appearing(motion: Motion, time: float) -> Motion:
-    """Return ``motion``, except that the obstacle is far away before ``time`` [s]."""
+    """Return a motion that equals ``motion`` from ``time`` [s] on; before, the obstacle is at :data:`AWAY`."""
     return lambda now: AWAY if now < time else motion(now)
 
 
@@ -85,9 +88,10 @@ def weaving(
 def turning(
     rng: np.random.Generator, obstacle: Obstacle, time: float, velocity: Array, side: Array, fastest: float
 ) -> Motion:
-    """Return a motion on a circle; at the meeting point, the obstacle moves with ``velocity``.
+    """Return a motion on a circle. At the meeting point, the velocity of the obstacle is ``velocity``.
 
-    The arguments are those of :func:`weaving`; ``side`` points to the centre of the circle.
+    The arguments are the same as for :func:`weaving`, but ``side`` points from the obstacle to the centre of the
+    circle.
     """
     speed = min(float(np.linalg.norm(velocity)), fastest)
     at, rate = obstacle.solid().position, float(rng.uniform(*_RATE))

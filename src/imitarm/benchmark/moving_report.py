@@ -1,6 +1,7 @@
-"""The results of the moving benchmark as one self-contained HTML page: charts, tables, and playback.
+"""Write the results of the moving benchmark as one HTML page with charts, tables, and playbacks.
 
-Results hold no paths. The experiments are deterministic, so the report repeats each experiment whose motion it draws.
+The results do not contain the paths of the tool. To draw a motion, the report repeats the experiment, which gives the
+same motion.
 """
 
 from __future__ import annotations
@@ -36,9 +37,9 @@ _PLAYED: Final = 6  # scenes that are drawn when none is named
 _RATE: Final = 25.0  # [1/s] frames
 _RESPONSE: Final = 0.25  # [m] gap below which Fig 5.10 links tool and obstacle
 _WORDS: Final = {
-    "Success": "The tool touches no true obstacle, and reaches the goal within twice the learned duration.",
-    "Oracle": "An independent search in space and time. One oracle knows the true future of the obstacles, "
-    "the other knows only the tracked obstacles.",
+    "Success": "The tool touches no obstacle and reaches the goal within twice the learned duration.",
+    "Oracle": "A search in space and time. One oracle knows the true future motion of the obstacles, "
+    "the other knows only the tracked obstacles, like the methods.",
     "RMSE": "Root mean square distance from the learned motion at equal times.",
     "NEES": "Normalised estimation error squared of a tracked position; its mean is 3 if the covariance is right.",
 }
@@ -57,8 +58,8 @@ def write_moving_report(
         results: results of the benchmark.
         path: the file to write; its folder must exist.
         provenance: facts needed to repeat the benchmark.
-        scenes: scenes to draw, as family, dimension and seed; if empty, failures of our methods are chosen first, then
-            one success in each family.
+        scenes: scenes to draw, as family, dimension and seed. If empty, the report draws failures of our methods and
+            one success in each family, at most six scenes.
 
     Raises:
         InputError: when the file can't be written, a scene has no result, or the drawing libraries are not installed.
@@ -73,7 +74,7 @@ def moving_report_html(
     provenance: Mapping[str, Any],
     scenes: Sequence[tuple[str, int, int]] = (),
 ) -> str:
-    """Return the whole page; see :func:`write_moving_report`."""
+    """Return the whole page as HTML; for the arguments, see :func:`write_moving_report`."""
     tables = moving_tables(results)
     chosen = _named(results, scenes) if scenes else _chosen(results)
     shared, tabs = _tabs(chosen)
@@ -130,7 +131,10 @@ def success_chart(results: MovingResults, family: str) -> str:
 
 
 def responses_chart(case: MovingCase, run: ToolRun, name: str) -> str:
-    """Draw thesis Fig 5.10: paths of tool and obstacles from above; lines link the two where their gap is small."""
+    """Draw the paths of tool and obstacles from above, as in thesis Fig 5.10.
+
+    Lines link tool and obstacle where their gap is below 25 cm.
+    """
     learned = case.skill.nominal(np.linspace(0.0, case.skill.duration_, 200)).positions
     places = np.array([case.truth.poses(float(t))[0] for t in run.times])
     near = distances_in_time(case.truth, run.times, run.positions) - case.tool_spheres[0, 3] < _RESPONSE
@@ -157,7 +161,7 @@ def responses_chart(case: MovingCase, run: ToolRun, name: str) -> str:
 
 
 def recording_of(experiment: MovingExperiment, case: MovingCase, run: ToolRun) -> Recording:
-    """Return a recording of the tool and the true obstacles, with the predictions of the tracker."""
+    """Return a recording for the playback: the tool, the true obstacles and the predictions of the tracker."""
     spec = mujoco.MjSpec()
     add_obstacles(spec, case.truth.scene)
     tool = spec.worldbody.add_body(name="tool", mocap=True)
@@ -184,13 +188,16 @@ def _named(results: MovingResults, scenes: Sequence[tuple[str, int, int]]) -> li
     for scene in scenes:
         rows = results.by_scene.get(scene)
         if rows is None:
-            raise InputError(f"{scene[0]}, {scene[1]}-D, seed {scene[2]}: there is no result of this scene")
+            raise InputError(
+                f"{scene[0]}, {scene[1]}-D, seed {scene[2]}: there is no result of this scene; run the benchmark with "
+                "this seed"
+            )
         chosen += [rows[row] for row in results.rows if row in rows and row not in CONTROLS]
     return chosen
 
 
 def _chosen(results: MovingResults) -> list[MovingResult]:
-    """Return contacts of our methods, then one scene of each of the first families."""
+    """Return failures of our methods first, and then one success in each family; at most six results."""
     ours = [row for row in results.rows if row.split(",")[0] in OURS] or results.rows[:1]
     found = [r for row in ours for r in results.of(row) if not r.success][: _PLAYED // 2]
     for family in results.families():

@@ -1,4 +1,4 @@
-"""Saved results of the moving benchmark, and the rows and scenes of its tables."""
+"""Saved results of the moving benchmark, which can be selected by table row, family and scene."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RESULTS = ResultFormat("imitarm-moving-result 1", MovingExperiment, MovingResult
 
 
 class MovingResults:
-    """Results of many experiments, by scene and by table row; a row is a method with its options."""
+    """Results of many experiments, by scene and by table row. Each row of a table is a method with its options."""
 
     def __init__(self, results: Sequence[MovingResult]) -> None:
         self.all = list(results)
@@ -35,7 +35,7 @@ class MovingResults:
 
     @staticmethod
     def row_of(result: MovingResult) -> str:
-        """Return the name of the table row of a result: the method, and the options that differ from its defaults."""
+        """Return the name of the table row of a result: the method, and the options that replace its defaults."""
         options = ", ".join(f"{name} {value}" for name, value in result.experiment.options)
         return f"{result.experiment.method}{', ' if options else ''}{options}"
 
@@ -47,7 +47,7 @@ class MovingResults:
 
     @cached_property
     def rows(self) -> list[str]:
-        """The names of the table rows: first the methods, the most successful first, then the controls."""
+        """The names of the table rows: first the methods in the order of their success, then the controls."""
         by_row: dict[str, list[bool]] = defaultdict(list)
         for result in self.all:
             by_row[self.row_of(result)].append(result.success)
@@ -61,12 +61,12 @@ class MovingResults:
         return [family for family in FAMILIES if family in there]
 
     def of(self, row: str, family: str | None = None) -> list[MovingResult]:
-        """Return the results of a row, in one family or in all."""
+        """Return the results of a row in one family; None: in all families."""
         return [r for r in self.all if self.row_of(r) == row and (family is None or r.experiment.family == family)]
 
     @cached_property
     def by_scene(self) -> dict[Scene, dict[str, MovingResult]]:
-        """The results of each scene, by row."""
+        """For each scene, the result of each row."""
         found: dict[Scene, dict[str, MovingResult]] = defaultdict(dict)
         for result in self.all:
             found[result.experiment.scene][self.row_of(result)] = result

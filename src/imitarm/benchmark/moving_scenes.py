@@ -1,4 +1,4 @@
-"""Scenes of ``imitarm benchmark moving``: families of moving obstacles that hit a tool which does not avoid them.
+"""Scenes of ``imitarm benchmark moving``: in every scene, moving obstacles hit a tool that follows the learned motion.
 
 | family | obstacles |
 |---|---|
@@ -13,10 +13,9 @@
 | M9 | an obstacle that rotates about its centre while it moves |
 | M10 | a person's arm, as two capsules, from recordings of real persons |
 
-For each obstacle, a random time is drawn. At this time, the obstacle is where the tool would be on the learned path.
-The speed of an obstacle is 0.1 to 0.6 m/s. A scene is drawn again in three cases: the tool of the learned motion would
-touch nothing; an obstacle covers the start at the beginning; or an obstacle covers the goal between 1 and 1.6 times the
-learned duration.
+At a random time, an obstacle is where the tool would be on the learned path. The speed of an obstacle is 0.1 to 0.6
+m/s. A random scene is used only if it meets three conditions. The learned motion touches an obstacle. No obstacle
+covers the start at the beginning. No obstacle covers the goal between 1 and 1.6 times the learned duration.
 """
 
 from __future__ import annotations
@@ -44,9 +43,9 @@ from imitarm.trajectory import Trajectory
 Array = NDArray[np.float64]
 
 SLOWEST, FASTEST = 0.1, 0.6
-"""Smallest and largest speed of an obstacle [m/s]; a person's arm moves as it was recorded."""
+"""Smallest and largest speed of an obstacle [m/s]. A person's arm (family M10) has its recorded speed instead."""
 LONGEST = 1.6
-"""No obstacle covers the goal until this multiple of the learned duration."""
+"""From the end of the learned motion until this multiple of the learned duration, no obstacle covers the goal."""
 _MET = 0.25, 0.7  # fractions of the duration between which an obstacle meets the tool
 _OFF = 0.012  # [m] standard deviation of the meeting point about the path
 _FREE = TOOL_RADIUS + CLEARANCE + 0.005  # [m] from the tool's tip, at the start and at the goal
@@ -64,11 +63,11 @@ class MovingCase:
 
     Attributes:
         family: name of the family, one of :data:`FAMILIES`.
-        dimension: 2 when the path may only be displaced horizontally, else 3.
+        dimension: 2 if the method may displace the path only horizontally; 3 if every direction is allowed.
         seed: number of the scene.
-        skill: the skill whose motion is blocked.
-        truth: the true obstacles over time; their motion begins before time 0.
-        touched: time at which the tool of the learned motion first touches an obstacle [s].
+        skill: the skill whose motion the obstacles block.
+        truth: the true motion of the obstacles, which begins before time 0.
+        touched: time at which the learned motion without avoidance first touches an obstacle [s].
         tool_spheres: spheres that cover the tool, rows x y z radius in the tool's frame, shape (m, 4) [m].
         clearance: required clearance [m].
         forbidden: directions in which the path must not be displaced.
@@ -134,13 +133,13 @@ class _Draw(NamedTuple):
 
 
 def moving_case(family: str, dimension: int, seed: int, *, skill: Skill | None = None) -> MovingCase:
-    """Return one scene; the same arguments give the same scene on every machine.
+    """Return one scene. The same arguments give the same scene on every machine.
 
     Args:
         family: one of :data:`FAMILIES`.
-        dimension: 2 when the path may only be displaced horizontally, else 3.
-        seed: number of the scene; 1000 to 1199 are for validation, 2000 to 3999 for tests.
-        skill: another skill; None: the S-shaped reach of the static benchmark.
+        dimension: 2 if the method may displace the path only horizontally; 3 if every direction is allowed.
+        seed: seed of the scene. Seeds 1000 to 1199 are for tuning, and seeds 2000 to 3999 are for testing.
+        skill: skill whose path the obstacles block; None: the S-shaped reach of the static benchmark.
 
     Raises:
         UnknownNameError: when there is no such family.
@@ -166,17 +165,18 @@ def moving_case(family: str, dimension: int, seed: int, *, skill: Skill | None =
             forbidden = HORIZONTAL_ONLY if dimension == 2 else ()
             return MovingCase(family, dimension, seed, own, truth, touched, forbidden=forbidden)
     raise InputError(
-        f"no scene of {family} blocks the path and leaves its start and its goal free; choose another skill"
+        f"no scene of {family} could be made in which obstacles block the path but not its start and goal; choose "
+        "another skill"
     )
 
 
 def distances_in_time(truth: MovingScene | Scene, times: Array, points: Array) -> Array:
-    """Return the signed distance of a moving point to each obstacle, shape (n_obstacles, n) [m].
+    """Return the signed distance between a moving point and each obstacle, shape (n_obstacles, n) [m].
 
     Args:
         truth: the true obstacles over time.
         times: shape (n,) [s].
-        points: position at each time, shape (n, 3) [m].
+        points: position of the point at each time, shape (n, 3) [m].
     """
     scene = truth if isinstance(truth, Scene) else truth.scene
     found = np.empty((len(scene.obstacles), len(times)))

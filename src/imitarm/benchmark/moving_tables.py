@@ -1,4 +1,4 @@
-"""Tables of the moving benchmark: success, quality of the motions, tracking, contacts, and the claims of the thesis."""
+"""Tables of the moving benchmark: success, quality of the motions, tracking, contacts, and claims of the thesis."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ READINGS = {
     "GMM+DMP": ("gmm-dmp",),
     "GMM+IRL": ("gmm-irl",),
 }
-"""For each method in Figs 5.7 and 5.11 of the thesis, the methods of this library that stand for it."""
+"""For each method in Figs 5.7 and 5.11 of the thesis, our interpretations of this method."""
 _LISTED = 12  # contacts in a table
 _FORESEEN, _CAUSAL = ORACLES
 
 
 def moving_tables(results: MovingResults) -> list[Table]:
-    """Return all tables: first the tables of the tool without an arm, then the tables of each arm."""
+    """Return all tables. The tables of the tool without an arm come before the tables of each arm."""
     arms = [setting for setting in results.settings if setting != "tool"]
     found = _tool_tables(results.in_setting("tool")) if "tool" in results.settings else []
     for setting in arms:
@@ -47,8 +47,8 @@ def moving_tables(results: MovingResults) -> list[Table]:
 
 
 _ARM_NOTE = (
-    "Clearance and contacts are those of the whole arm. In 'no-avoidance', only the safety filter changes the learned "
-    "motion.  Intervals: Wilson."
+    "Clearance and contacts are those of the whole arm. The method 'no-avoidance' follows the learned motion, which "
+    "only the safety filter changes.  Intervals: Wilson."
 )
 
 
@@ -61,7 +61,7 @@ def _tool_tables(results: MovingResults) -> list[Table]:
 
 
 def success_table(results: MovingResults) -> Table:
-    """Return a table of the rates of success and of all other outcomes, over all families."""
+    """Return a table of the rate of success and the number of each other outcome, over all families."""
     rows = []
     for row in results.rows:
         found = results.of(row)
@@ -92,10 +92,10 @@ def success_table(results: MovingResults) -> Table:
     )
     broken = sum(not limits_kept(dict(r.values)) for r in results.all)
     note = (
-        "Success: the tool touches no true obstacle, and comes within 5 mm of the goal in at most twice the learned "
+        "Success: the tool touches no obstacle, and comes within 5 mm of the goal in at most twice the learned "
         f"duration. The tool is limited to {MAX_SPEED:g} m/s and {MAX_ACCELERATION:g} m/s^2; {broken} runs exceed "
-        "these limits. Intervals: Wilson. Time per step: each run has a median and a 99th percentile; the table shows "
-        "their medians over the runs."
+        "these limits. Intervals: Wilson. Time per step: medians, over the runs, of the median and the 99th "
+        "percentile of each run."
     )
     return Table("Success among moving obstacles", columns, tuple(rows), note)
 
@@ -115,7 +115,7 @@ def family_table(results: MovingResults) -> Table:
     solved = _solved(results)
     if solved:
         parts = ", ".join(f"{good} of {of} in {family}" for family, (good, of) in solved.items())
-        note += f" Number of scenes that the oracle with the true future solves: {parts}."
+        note += f" Number of scenes that the oracle with the true future motion solves: {parts}."
     columns = ("method", *(f"{family}>" for family in families))
     return Table("Success % (95 %) in each family", columns, tuple(rows), note)
 
@@ -130,7 +130,7 @@ def _solved(results: MovingResults) -> dict[str, tuple[int, int]]:
 
 
 def quality_table(results: MovingResults) -> Table:
-    """Return a table of the measures of the successes."""
+    """Return a table of the measures of the successful motions."""
     rows = []
     for row in results.rows:
         good = [r for r in results.of(row) if r.success]
@@ -163,16 +163,16 @@ def quality_table(results: MovingResults) -> Table:
         "LDLJ>",
     )
     note = (
-        "Each row includes only the scenes in which its method succeeds. These scenes differ between methods, so the "
-        "paired table compares methods better. RMSE: distance from the learned motion at equal times. Unaffected: "
-        f"RMSE over the samples at which the tool of the learned motion is farther than {100 * NEAR:.0f} cm from every "
-        "obstacle. Of the path: RMSE from the nearest point of the learned path."
+        "Each row includes only the scenes in which its method succeeds. These scenes differ between methods, so "
+        "compare methods in the table of paired comparisons instead. RMSE: distance from the learned motion at equal "
+        "times. Unaffected: RMSE over the samples at which the tool of the learned motion is farther than "
+        f"{100 * NEAR:.0f} cm from every obstacle. Of the path: RMSE from the nearest point of the learned path."
     )
     return Table("Quality of the successful motions", columns, tuple(rows), note)
 
 
 def rmse_table(results: MovingResults, families: Sequence[str], title: str) -> Table:
-    """Return the RMSE of the methods that the thesis compares, in families of scenes."""
+    """Return a table of the RMSE of the methods that the thesis compares, in the given families of scenes."""
     rows = []
     for name, methods in READINGS.items():
         for row in results.rows:
@@ -205,7 +205,7 @@ def _paired(results: MovingResults, row: str, other: str, families: Sequence[str
 
 
 def paired_table(results: MovingResults) -> Table:
-    """Return a table that compares our first method with each other method, in the same scenes."""
+    """Return a table that compares our most successful method with each other method in the same scenes."""
     ours = next((row for row in results.rows if row in OURS), None)
     if ours is None:
         return Table("Paired comparison", (), ())
@@ -228,8 +228,8 @@ def paired_table(results: MovingResults) -> Table:
         "p>",
     )
     note = (
-        "p: McNemar's exact test of the successes, and Wilcoxon's signed-rank test of the RMSE; Holm's method corrects "
-        "both."
+        "The first p is that of McNemar's exact test of the successes. The second p is that of Wilcoxon's signed-rank "
+        "test of the RMSE. Holm's method corrects both for the number of methods."
     )
     return Table(f"{ours} and each other method in the same scenes", columns, tuple(rows), note)
 
@@ -239,7 +239,7 @@ def _p(value: float) -> str:
 
 
 def claims_table(results: MovingResults) -> Table:
-    """Return a table of the claims of thesis Chapter 5 and the benchmark's own checks, each with its result."""
+    """Return a table of claims of thesis Chapter 5 and of checks of the benchmark itself, with their results."""
     rows = [
         _claim(
             results, "DMP+AT has a smaller RMSE than RCAMO with one moving obstacle (Fig 5.7)", FEW, ("DMP+AT",), -1
@@ -264,7 +264,7 @@ def claims_table(results: MovingResults) -> Table:
 
 
 def _best(results: MovingResults, name: str, families: Sequence[str]) -> str | None:
-    """Return our row for a method of the thesis that succeeds most often in these families."""
+    """Return the most successful of our interpretations of a thesis method in these families; None if none was run."""
     there = [row for row in results.rows if row.split(",")[0] in READINGS[name]]
     return max(
         there, key=lambda row: sum(r.success for family in families for r in results.of(row, family)), default=None
@@ -274,7 +274,10 @@ def _best(results: MovingResults, name: str, families: Sequence[str]) -> str | N
 def _claim(
     results: MovingResults, text: str, families: Sequence[str], others: Sequence[str], sign: int
 ) -> tuple[str, str, str]:
-    """Compare the RMSE of RCAMO and others; ``sign`` is 1 where the thesis says that RCAMO's is smaller."""
+    """Compare the RMSE of RCAMO with that of other methods.
+
+    ``sign`` is 1 if the thesis claims a smaller RMSE of RCAMO.
+    """
     ours = "rcamo" if "rcamo" in results.rows else None
     parts, held = [], []
     for name in others:
@@ -314,7 +317,7 @@ def _success_claim(results: MovingResults, text: str, families: Sequence[str]) -
 
 
 def sensor_table(results: MovingResults) -> Table:
-    """Return a table of the rates of success for each sensor; it is empty if all runs used the same sensor."""
+    """Return a table of the rates of success for each sensor. The table is empty if all runs used the same sensor."""
     sensors = sorted({results.sensor_of(r) for r in results.all})
     if len(sensors) < 2:
         return Table("Success by sensor", (), ())
@@ -332,7 +335,7 @@ def sensor_table(results: MovingResults) -> Table:
 
 
 def tracking_table(results: MovingResults) -> Table:
-    """Return a table of the errors of the tracked obstacles in each family; they do not depend on the method."""
+    """Return a table of the tracker's errors in each family. These errors do not depend on the method."""
     rows = []
     for family in results.families():
         found = next((of for row in results.rows if (of := results.of(row, family))), [])
@@ -355,14 +358,14 @@ def tracking_table(results: MovingResults) -> Table:
         "time without a track [%]>",
     )
     note = (
-        "Errors at the current time, for which the tracker predicts each obstacle over the latency. Means over "
-        "the runs of one method."
+        "Errors of the positions and velocities that the tracker predicts for the present time. Means over the runs "
+        "of one method."
     )
     return Table("Tracked obstacles", columns, tuple(rows), note)
 
 
 def causes_table(results: MovingResults) -> Table:
-    """Return the number of contacts of each method, by cause."""
+    """Return a table of the number of contacts of each method, by cause."""
     causes = sorted({c["cause"] for r in results.all for c in r.values.get("contacts", ())})
     rows = []
     for row in results.rows:
@@ -370,12 +373,17 @@ def causes_table(results: MovingResults) -> Table:
         counts = Counter(c["cause"] for c in found)
         away = sum(c["tool_speed"] is not None and c["tool_speed"] <= 0.0 for c in found)
         rows.append((row, str(len(found)), *(str(counts[c]) for c in causes), str(away)))
-    columns = ("method", "contacts>", *(f"{cause}>" for cause in causes), "of these, the tool yields or stands>")
+    columns = (
+        "method",
+        "contacts>",
+        *(f"{cause}>" for cause in causes),
+        "contacts in which the tool stands or moves away>",
+    )
     return Table("Contacts by cause", columns, tuple(rows) if causes else ())
 
 
 def contacts_table(results: MovingResults) -> Table:
-    """Return the contacts of our methods, one row for each."""
+    """Return a table with one row for each contact of our methods."""
     rows = []
     for row in results.rows:
         if row.split(",")[0] not in OURS:
@@ -393,8 +401,8 @@ def contacts_table(results: MovingResults) -> Table:
         "braking",
         "status",
         "cause",
-        "oracle with the true future",
-        "causal oracle",
+        "outcome of the oracle with the true future",
+        "outcome of the oracle with the tracked obstacles",
     )
     oracles = [{r.experiment.scene: r.outcome for r in results.of(name)} for name in (_FORESEEN, _CAUSAL)]
     full = [(*cells, *(oracle.get(scene, "not run") for oracle in oracles)) for scene, cells in rows[:_LISTED]]

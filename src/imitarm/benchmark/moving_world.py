@@ -1,4 +1,4 @@
-"""The world of the moving benchmark without an arm: a tool that moves as it is commanded, within its limits."""
+"""The world of the moving benchmark without an arm: a tool that follows the commanded velocity within its limits."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ _STILL = 0.005  # [m/s] a tool slower than this is at rest
 
 
 class Seen(NamedTuple):
-    """What the policy observed in one control step: the time [s] and the tracked obstacles.
+    """The tracked obstacles that the policy observed in one control step.
 
     Attributes:
         time: time of the observation [s].
         positions: position of each tracked obstacle, shape (n, 3) [m].
         velocities: velocity of each tracked obstacle, shape (n, 3) [m/s].
-        covariances: covariance of each position, shape (n, 3, 3) [m^2]; nan where it is unknown.
+        covariances: covariance of each position, shape (n, 3, 3) [m^2]; nan if it is unknown.
         track_ids: number of each track, shape (n,).
     """
 
@@ -55,14 +55,14 @@ class ToolRun:
     """The motion of the tool in one run.
 
     Attributes:
-        times: start of each control period, and end of the last one, shape (n + 1,) [s].
+        times: start of each of the n control periods, and end of the last period, shape (n + 1,) [s].
         positions: positions of the tool at these times, shape (n + 1, 3) [m].
-        statuses: status of the policy's command in each period, n values.
-        seen: observed obstacles at every third step.
-        step_seconds: time of each call of the policy's ``step`` [s].
-        reset_seconds: time of the policy's ``reset`` [s].
+        statuses: status of the policy's command in each of the n periods.
+        seen: what the policy observed in every third control step.
+        step_seconds: computing time of each call of the policy's ``step`` [s].
+        reset_seconds: computing time of the policy's ``reset`` [s].
         arrived: whether the policy reported that the motion has arrived.
-        refusal: why the policy refused before any motion; empty if it did not.
+        refusal: reason why the policy refused the task before any motion; empty if it did not refuse.
         last: the last command of the policy.
     """
 
@@ -78,21 +78,24 @@ class ToolRun:
 
 
 def run_tool(policy: Policy, case: MovingCase, observe: Callable[[float], Scene]) -> ToolRun:
-    r"""Let a policy move the tool in a scene, until the tool rests at the goal, for at most twice the learned duration.
+    r"""Run a policy with a tool in a scene.
 
-    The tool follows the commanded velocity as well as its limits allow. With the control period ``h``:
+    The run ends when the tool rests at its goal, or after twice the learned duration.
+
+    The velocity v of the tool follows the commanded velocity u within the limits of speed and acceleration. With the
+    control period h, the position x of the tool is
 
     .. math::
         v_{k+1} = v_k + \mathrm{clip}(u_k - v_k,\ a_{max} h), \qquad x_{k+1} = x_k + h v_{k+1},
         \qquad |v| \le v_{max}
 
-    The limits of speed and acceleration are those of the static benchmark. If the tool has arrived, or if the policy
-    refuses, the tool stops. The tool never rotates.
+    The limits :math:`v_{max}` and :math:`a_{max}` are the same as in the static benchmark. After its arrival, the tool
+    brakes. The tool never rotates.
 
     Args:
         policy: the policy.
         case: the scene.
-        observe: function of the time [s] that returns the scene as the policy knows it.
+        observe: function that returns, for a time [s], the scene that the policy observes.
     """
     state = ArmState(np.zeros(0), np.zeros(0), np.zeros(0), 0.0)
     x, v = case.skill.start_.position.copy(), np.zeros(3)
@@ -124,7 +127,7 @@ def run_tool(policy: Policy, case: MovingCase, observe: Callable[[float], Scene]
 
 
 def within_limits(velocity: Array, wanted: Array, dt: float = DT) -> Array:
-    """Return the velocity after one period that is nearest to ``wanted`` within the limits, shape (3,) [m/s]."""
+    """Return the velocity after one period, shape (3,) [m/s]: as near to ``wanted`` as the limits allow."""
     size = float(np.linalg.norm(wanted))
     target = wanted * min(1.0, MAX_SPEED / size) if size > 0.0 else wanted
     change = target - velocity
