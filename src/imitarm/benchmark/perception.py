@@ -1,4 +1,4 @@
-"""Benchmark of perception: detected obstacles compared with the simulator's truth."""
+"""Benchmark of perception: compare the detected obstacles with the true obstacles of the simulator."""
 
 from __future__ import annotations
 
@@ -33,17 +33,18 @@ class Seen:
         family: family of the scene.
         shape: true shape.
         distance: distance of the camera from the middle of the table [m].
-        first: whether this is the main obstacle of the scene, after which its family is named.
-        pixels: number of pixels of the image that show the obstacle.
+        first: whether this is the first obstacle of the scene. The name of the family describes this obstacle.
+        pixels: number of image pixels that show the obstacle.
         uncovered: fraction of the obstacle's volume that lies outside every detection.
         sticks_out: largest distance from a point of the obstacle's surface to the nearest detection [m].
-        excess: largest distance from a surface point of the detection to the nearest true obstacle [m]. This value and
-            the following values are nan if the obstacle was missed, or was detected together with another obstacle as
-            one.
-        error: distance of the detection's position from the true position [m].
-        size_error: mean absolute difference between the lengths of obstacle and detection along three directions [m].
-        normalised: squared Mahalanobis distance of the position error, with the covariance of the detection.
-        right_shape: whether the detection has the obstacle's kind of shape.
+        excess: largest distance from a surface point of the detection to the nearest true obstacle [m]; nan if the
+            obstacle was missed or merged with another obstacle.
+        error: distance between the detected and the true position [m]; nan in the same cases as ``excess``.
+        size_error: mean absolute difference between the true and the detected lengths along three directions [m]; nan
+            in the same cases as ``excess``.
+        normalised: squared Mahalanobis distance of the position error, by the covariance of the detection; nan in the
+            same cases as ``excess``.
+        right_shape: whether the detection has the true kind of shape, for example a sphere; False in the same cases.
     """
 
     family: str
@@ -61,7 +62,7 @@ class Seen:
 
     @property
     def merged(self) -> bool:
-        """Whether the obstacle was detected together with another obstacle, as one."""
+        """Whether the detector merged the obstacle with another obstacle into one detection."""
         return not self.missed and bool(np.isnan(self.error))
 
     @property
@@ -76,7 +77,7 @@ class Frame:
 
     Attributes:
         family: family of the scene.
-        seen: the obstacles of which at least 12 pixels are visible in the image.
+        seen: the obstacles that cover at least 12 pixels of the image.
         false: number of detections farther than 5 cm from every obstacle.
         detections: number of detections.
         seconds: processor time of the detection [s].
@@ -90,7 +91,7 @@ class Frame:
 
 
 def run_frame(family: str, seed: int, *, noise: DepthNoise, height: int = 120) -> Frame:
-    """Detect the obstacles of one scene and compare them with the truth."""
+    """Detect the obstacles in an image of one scene, and compare them with the true obstacles."""
     scene = make_scene(family, seed)
     exact, noisy = images(scene, noise, height)
     arm = perception_arm()
@@ -121,12 +122,13 @@ def run_frames(
     """Evaluate ``count`` scenes of each family.
 
     Args:
-        count: number of scenes.
+        count: number of scenes of each family.
         first: first seed.
         families: families of scenes.
         noise: noise of the camera; None: the noise of a Kinect.
-        height: number of rows of the image.
-        on_done: called with the number of evaluated scenes and the number of all scenes.
+        height: number of rows of each image.
+        on_done: function that is called after each scene, with the number of evaluated scenes and the number of all
+            scenes.
     """
     count = whole_number(count, "count", at_least=1)
     noise = DepthNoise() if noise is None else noise
@@ -219,7 +221,7 @@ def _distance(obstacle: Obstacle, others: Iterable[Obstacle]) -> float:
 
 
 def tables(frames: Sequence[Frame]) -> list[Table]:
-    """Return the tables of the benchmark: by family, by shape, by distance, and the processor time."""
+    """Return the tables of the benchmark: quality by family, by shape and by distance, and processor times."""
     seen = [one for frame in frames for one in frame.seen]
     families = [family for family in FAMILIES if any(frame.family == family for frame in frames)]
     by_family = [
@@ -251,18 +253,19 @@ def tables(frames: Sequence[Frame]) -> list[Table]:
             ),
             tuple(_cost(family, own) for family, own in false if own),
             "A detection is false if it is farther than 5 cm from every obstacle. Time: processor time of one thread "
-            "for each image; images/s is the inverse of the mean time.",
+            "for one image. Images/s: inverse of the mean time.",
         ),
     ]
 
 
 _NOTE = (
-    f"The tables count obstacles that cover at least {LEAST_VISIBLE} pixels of the image. Missed: less than a fifth of "
-    "the obstacle's volume lies inside the detections. Merged: the obstacle was detected together with another "
-    "obstacle, as one. Uncovered: mean fraction of the volume that lies outside every detection. Sticks out: largest "
-    "distance from a point of the true surface to the detections. Too large: largest distance from a point of the "
-    "detection's surface to the true obstacles. In 95 % region: fraction of the positions whose error lies in the 95 "
-    "% region of the estimated covariance."
+    f"The tables count obstacles that cover at least {LEAST_VISIBLE} pixels of the image. Missed: less than a fifth "
+    "of the obstacle's volume lies inside the detections. Merged: the detector merged the obstacle with another "
+    "obstacle into one detection. Uncovered: mean fraction of the volume that lies outside every detection. Obstacle "
+    "outside the detections: largest distance from a point of the obstacle's surface to the nearest detection. "
+    "Detection outside the obstacles: largest distance from a point of the detection's surface to the nearest "
+    "obstacle. In the 95 % region: fraction of the position errors that lie in the 95 % region of the estimated "
+    "covariance."
 )
 
 
@@ -276,9 +279,9 @@ def _quality(title: str, what: str, groups: Iterable[tuple[str, list[Seen]]], no
         "position error, 95th percentile [mm]>",
         "size error, median [mm]>",
         "uncovered [%]>",
-        "sticks out, median [mm]>",
-        "sticks out, 95th percentile [mm]>",
-        "too large, median [mm]>",
+        "obstacle outside the detections, median [mm]>",
+        "obstacle outside the detections, 95th percentile [mm]>",
+        "detection outside the obstacles, median [mm]>",
         "same shape [%]>",
         "in the 95 % region>",
     )

@@ -1,4 +1,4 @@
-"""Seeded scenes in front of a depth camera, with the true obstacles, for the benchmark of perception."""
+"""Random scenes in front of a depth camera, for the benchmark of perception. A seed determines each scene."""
 
 from __future__ import annotations
 
@@ -33,8 +33,9 @@ Array = NDArray[np.float64]
 
 SHAPES = ("sphere", "box", "cylinder", "capsule", "cone", "ellipsoid", "convex hull")
 FAMILIES = ("one object", "held bottle", "in contact", "half hidden", "empty")
-"""Families of scenes: one object of any shape, standing or floating; a bottle that a forearm with a hand holds; two
-objects that touch each other; an object half hidden behind another object; and no object at all."""
+"""Families of scenes. "one object": an object of any shape, which stands on the table or floats. "held bottle": a
+bottle, and the forearm and hand that hold it. "in contact": two objects that touch each other. "half hidden": an object
+that another object hides about half from the camera. "empty": no object."""
 DISTANCES = (1.0, 2.0, 3.0)
 """Distances of the camera from the middle of the table [m]."""
 MOST = 10_000  # seeds of one family
@@ -49,15 +50,15 @@ _TRIES = 500
 
 @dataclass(frozen=True, eq=False)
 class PerceptionScene:
-    """Obstacles on and above a table beside an arm, and a camera.
+    """A scene: obstacles on and above a table beside an arm, and the pose of a camera.
 
     Attributes:
         family: one of :data:`FAMILIES`.
         seed: seed of the scene.
-        obstacles: the true obstacles; the first is the main obstacle, after which the family is named.
+        obstacles: the true obstacles. The name of the family describes the first obstacle.
         camera_to_base: pose of the camera in the frame of the arm's base.
         distance: distance of the camera from the middle of the table [m].
-        fixtures: floor, pedestal and table.
+        fixtures: fixed surfaces: floor, pedestal and table.
     """
 
     family: str
@@ -80,9 +81,9 @@ def perception_arm() -> ArmModel:
 
 
 def make_scene(family: str, seed: int) -> PerceptionScene:
-    """Return one scene; the same seed gives the same scene on every machine.
+    """Return one scene. The same seed gives the same scene on every machine.
 
-    The seed also chooses shape and distance in turn, so that each combination is equally frequent.
+    Successive seeds go through all combinations of shape and distance, so each combination is equally frequent.
 
     Raises:
         UnknownNameError: when there is no such family.
@@ -100,15 +101,15 @@ def make_scene(family: str, seed: int) -> PerceptionScene:
         gaps = [float((obstacle.signed_distance(centers) - radii).min()) for obstacle in obstacles]
         if all(gap > _FROM_ARM for gap in gaps):
             return PerceptionScene(family, seed, obstacles, camera, distance)
-    raise InputError(f"no scene of the family {family!r} was found for seed {seed}")
+    raise InputError(f"no scene of the family {family!r} could be made from seed {seed}; choose another seed")
 
 
 def images(scene: PerceptionScene, noise: DepthNoise, height: int) -> tuple[DepthFrame, DepthFrame]:
-    """Return the exact image of a scene and the same image with noise; the robot is at its home posture.
+    """Return an image of a scene without noise, and the same image with noise. The robot is in its home posture.
 
     Args:
         scene: the scene.
-        noise: noise of the camera.
+        noise: noise that is added to the second image.
         height: number of rows of the image; the image has 4/3 as many columns.
     """
     robot = SimulatedRobot(perception_arm(), scene=Scene(None, scene.obstacles, fixtures=scene.fixtures))
@@ -139,7 +140,7 @@ def _standing(rng: np.random.Generator) -> Array:
 
 
 def make_object(shape: str, rng: np.random.Generator) -> Obstacle:
-    """Return one object, which stands on the table or floats above it, each with the probability 1/2.
+    """Return one object. It stands on the table with a probability of 1/2; otherwise it floats above the table.
 
     Raises:
         UnknownNameError: when there is no such shape.

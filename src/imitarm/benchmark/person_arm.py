@@ -1,4 +1,4 @@
-"""A real person's arm as two capsules that move through the scene, from recordings (family M10)."""
+"""Obstacles of family M10: two capsules that move like the recorded arm of a real person."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from imitarm.scene.obstacle import rotation_from_z
 Array = NDArray[np.float64]
 
 DATA = "IMITARM_DATA"
-"""Environment variable with the folder of real recordings."""
+"""Name of the environment variable that contains the path of the folder with real recordings."""
 _UPPER, _FORE = 0.050, 0.042  # [m] radii of the two capsules
 _STEP = 0.01  # [s]
 _SMOOTH = 0.06  # [s] standard deviation of the filter that removes the noise of the recordings
@@ -55,23 +55,24 @@ def _recordings(folder: str) -> tuple[_Recorded, ...]:
 
 
 def has_recordings() -> bool:
-    """Whether the recordings of real persons are there."""
+    """Return whether the folder of real recordings exists and contains the motion capture."""
     return (Path(os.environ.get(DATA, "")) / "mocap_arm" / "recording.tsv").is_file()
 
 
 def person_arm(
     rng: np.random.Generator, time: float, meeting: Array, until: float
 ) -> tuple[tuple[Capsule, Capsule], tuple[Track, Track]]:
-    """Return the upper arm and the forearm of a person as capsules, and their motions, at true size and speed.
+    """Return the upper arm and the forearm of a person as two capsules, and their recorded motions.
 
-    A recording, an instant in it, a point of the forearm and a rotation about the vertical axis are drawn at random.
-    The recording is shifted and rotated so that, at this instant, the drawn point is at the meeting point.
+    Sizes and speeds are those of the recording. The function randomly chooses a recording, an instant of the recording,
+    a point of the forearm, and a rotation about the vertical axis. It rotates and shifts the recording so that, at this
+    instant, the chosen point is at the meeting point.
 
     Args:
         rng: source of the random numbers.
-        time: time at which the drawn point of the forearm is at the meeting point [s].
+        time: time at which the chosen point of the forearm is at the meeting point [s].
         meeting: the meeting point on the learned path, shape (3,) [m].
-        until: samples of the recording after this time are left out [s].
+        until: time after which the returned motions end [s].
 
     Raises:
         InputError: when the recordings are missing.

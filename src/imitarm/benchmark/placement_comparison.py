@@ -1,4 +1,4 @@
-"""Compare a policy with baselines in the placements that they solve: acceptance, planning time, path."""
+"""Compare a policy with baselines in placements of obstacles: acceptance, planning time and executed path."""
 
 from __future__ import annotations
 
@@ -14,45 +14,45 @@ from imitarm.benchmark.tables import Table
 from imitarm.errors import InputError
 
 _STYLE_NOTE = (
-    "A planning time is the processor time until the policy accepts or refuses a placement; all placements count. The "
-    "other columns use only the motions that arrived. RMSE and deviation compare the path that the simulated arm "
-    "executed with the mean of the demonstrations as curves (200 points evenly spaced along the arc, matched by "
-    "dynamic time warping), because a planner chooses its own timing. Deviation: largest Mahalanobis distance along "
-    "the path, with the covariance of GMR plus (5 mm)² in every direction. Tilt: largest rotation of the tool from "
-    "the learned rotation at the nearest point of the learned path. Tilt limit 'default': acfra and rrt-connect-tilt "
-    "allow two standard deviations of the demonstrated rotation; rrt-connect allows any tilt."
+    "Planning: processor time until the policy accepts or refuses a placement, over all placements. The other columns "
+    "use only the motions that arrived. RMSE and deviation compare the path of the simulated arm with the mean of the "
+    "demonstrations. They do not depend on the timing: dynamic time warping matches 200 points that are evenly spaced "
+    "along each path. Deviation: largest Mahalanobis distance along the path, with the covariance of GMR plus (5 mm)² "
+    "in every direction. Tilt: largest rotation of the tool away from the learned rotation at the nearest point of "
+    "the learned path. Tilt limit 'default': acfra and rrt-connect-tilt allow two standard deviations of the "
+    "demonstrated rotation, and rrt-connect allows any tilt."
 )
 _PAIR_NOTE = (
-    "Each row includes only the placements that the baseline solves: its arm arrives, and keeps the clearance. "
-    "Accepted and solved: how many of these placements {policy} accepts and solves (Wilson's 95 % interval). All "
-    "ratios divide the value of {policy} by the value of the baseline. Planning time: ratio of the medians over these "
-    "placements, refusals included. RMSE and deviation: ratio of the medians over the placements that both policies "
-    "solve."
+    "Each row includes only the placements that the baseline solves: the arm arrives and keeps the clearance. "
+    "Accepted and solved: how many of these placements {policy} accepts and solves (Wilson's 95 % interval). A ratio "
+    "is the median of {policy} divided by the median of the baseline. Planning times: medians over all placements of "
+    "the row, including those that {policy} refuses. RMSE and deviation: medians over the placements that both "
+    "policies solve."
 )
 _RMSE_TARGET, _DEVIATION_TARGET = 0.7, 0.5
 
 
 class Variant(NamedTuple):
-    """A policy and its limit of the tool's tilt [rad]; if the limit is None, the policy uses its default."""
+    """A policy, and the largest tilt of the tool that it may use [rad]; None: the default of the policy."""
 
     policy: str
     max_tilt: float | None
 
     @property
     def limit(self) -> str:
-        """The limit of the tilt as text."""
+        """The largest tilt as text, in degrees."""
         return "default" if self.max_tilt is None else f"{np.degrees(self.max_tilt):.0f}°"
 
 
 Place = tuple[Setup, int]
-"""A setup and a seed, which determine a placement."""
+"""A placement, determined by a setup (skill and arm) and a seed."""
 
 
 def comparison_tables(results: Iterable[PlacementResult], policy: str = "acfra") -> list[Table]:
-    """Return a table of all policies and tilt limits, and a table that compares one policy with each other policy.
+    """Return two tables: one of all policies, and one that compares ``policy`` with each other policy.
 
     Args:
-        results: results of any policies in any placements.
+        results: results of at least two policies in the same placements.
         policy: name of the policy that is compared with all others.
 
     Raises:
@@ -65,7 +65,9 @@ def comparison_tables(results: Iterable[PlacementResult], policy: str = "acfra")
     own = [variant for variant in variants if variant.policy == policy]
     baselines = [variant for variant in variants if variant.policy != policy]
     if not own or not baselines:
-        raise InputError(f"comparison: needs results of {policy!r} and of another policy; run the placements with both")
+        raise InputError(
+            f"comparison: results of {policy!r} and of another policy are needed; run the placements with both policies"
+        )
     rows = [_style_row(variant, list(variants[variant].values())) for variant in variants]
     skills = dict.fromkeys(setup.skill for found in variants.values() for setup, _ in found)
     groups = [tuple(skills), *((skill,) for skill in skills)] if len(skills) > 1 else [tuple(skills)]

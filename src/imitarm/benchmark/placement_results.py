@@ -1,4 +1,4 @@
-"""Saved results of placements: one line of JSON for each, so that an interrupted benchmark can be continued."""
+"""Saved results of placements. Each result is one line of JSON, so that an interrupted benchmark can be continued."""
 
 from __future__ import annotations
 
@@ -56,19 +56,22 @@ class PlacementResult:
         setup: the skill and the arm.
         seed: seed of the placement.
         outcome: one of :data:`~imitarm.benchmark.placements.OUTCOMES`.
-        clearance: smallest measured distance from arm and tool to an obstacle [m]; nan if the arm did not move.
+        clearance: smallest measured distance between the arm (with its tool) and an obstacle [m]; nan if the arm did
+            not move.
         duration: duration of the motion divided by the duration of the skill; nan if the arm did not move.
-        planning: time until the policy accepted or refused the scene [s].
+        planning: wall-clock time until the policy accepted or refused the placement [s].
         reason: explanation of the outcome.
-        max_tilt: largest rotation of the tool that was allowed [rad]; None: the policy's default.
-        computing: processor time of the planning [s]; other programs disturb it less than they disturb ``planning``.
+        max_tilt: largest allowed rotation of the tool away from the learned rotation [rad]; None: the policy's default.
+        computing: processor time until the policy accepted or refused the placement [s]. Other programs disturb this
+            time less than ``planning``.
         rmse: distance of the executed path from the mean of the demonstrations, see
-            :class:`~imitarm.evaluation.path_style.PathStyle` [m]; nan unless the motion arrived.
-        deviation: largest deviation from the mean, in standard deviations of the demonstrations; nan unless the motion
-            arrived.
-        tilt: largest rotation of the tool away from the learned rotation [rad]; nan unless the motion arrived.
-        tool_rmse: for comparison, the ``rmse`` of a path that is planned for the tool alone, in the same scene and
-            between the same ends [m]. It is nan if no such path was found, or if the motion did not arrive.
+            :class:`~imitarm.evaluation.path_style.PathStyle` [m]; nan if the motion did not arrive.
+        deviation: largest deviation of the executed path from this mean, in standard deviations of the demonstrations;
+            nan if the motion did not arrive.
+        tilt: largest rotation of the tool away from the learned rotation during the motion [rad]; nan if the motion did
+            not arrive.
+        tool_rmse: the ``rmse`` of a path that is planned for the tool without the arm, in the same scene and between
+            the same ends [m]; nan if no such path was found, or if the motion did not arrive.
         code: version of the code, see :func:`~imitarm.benchmark.provenance.code_version`.
     """
 
@@ -95,12 +98,12 @@ class PlacementResult:
 
     @property
     def arrived(self) -> bool:
-        """Whether the motion arrived and kept its clearance."""
+        """Whether the motion arrived and kept the required clearance."""
         return self.outcome == "arrived"
 
     @property
     def accepted(self) -> bool:
-        """Whether the policy found a plan."""
+        """Whether the policy accepted the placement."""
         return self.outcome != "refused"
 
 
@@ -119,9 +122,9 @@ def append_result(path: Path, result: PlacementResult) -> None:
 
 
 def load_results(paths: Iterable[Path]) -> dict[Run, PlacementResult]:
-    """Read results from a file; if a run has several results, the last result counts.
+    """Read results from files. If a run has several results, the last result counts.
 
-    A last line without a line break is left out, because a program was killed before it finished this line.
+    A last line without a line break is ignored: the program was killed before it had finished this line.
 
     Raises:
         InputError: when a file can't be read.
@@ -132,7 +135,9 @@ def load_results(paths: Iterable[Path]) -> dict[Run, PlacementResult]:
         try:
             text = path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"{path}: can't be read as a file of results ({error})") from error
+            raise InputError(
+                f"{path}: can't be read as a file of results ({error}); name a file that --out wrote"
+            ) from error
         for number, line in enumerate(text.split("\n")[:-1], 1):
             result = _result(line, f"{path}, line {number}")
             found[result.run] = result
@@ -151,7 +156,7 @@ def _result(line: str, where: str) -> PlacementResult:
 
 
 def repaired(path: Path) -> None:
-    """Remove an incomplete last line from a file of results; do nothing if there is no file.
+    """Remove an incomplete last line from a file of results. The file need not exist.
 
     Raises:
         InputError: when the file can't be read or written.

@@ -1,4 +1,4 @@
-"""Tables of placements: outcomes and times, the motions that arrived late, and the cost of planning the whole arm."""
+"""Tables of placements: outcomes and times, late arrivals, and a comparison with plans for the tool alone."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _RATIO_TARGET = 1.1
 
 
 def placement_tables(results: Sequence[PlacementResult]) -> list[Table]:
-    """Return the tables of outcomes, of late arrivals, and of the RMSE in comparison with a plan for the tool alone.
+    """Return the tables of outcomes, of late arrivals, and of the RMSE compared with a plan for the tool alone.
 
     A table without rows is left out.
     """
@@ -63,8 +63,7 @@ def _outcomes(results: Sequence[PlacementResult]) -> Table:
             "time to refuse, median [ms]>",
         ),
         tuple(rows),
-        f"A simulated arm, every part of which must keep {1e3 * CLEARANCE:.0f} mm of clearance. Intervals: Wilson, 95 "
-        "%.",
+        f"Every part of the simulated arm must keep {1e3 * CLEARANCE:.0f} mm of clearance. Intervals: Wilson, 95 %.",
     )
 
 
@@ -73,9 +72,9 @@ def _late(results: Sequence[PlacementResult]) -> Table:
     late = sorted((r for r in results if r.arrived and r.duration > LATE), key=lambda r: -r.duration)
     return Table(
         f"Placements in which the arm arrived after more than {LATE:g} times the learned duration",
-        ("policy", "skill", "robot", "seed>", "duration, times the learned duration>"),
+        ("policy", "skill", "robot", "seed>", "duration divided by the learned duration>"),
         tuple((r.policy, Path(r.setup.skill).stem, r.setup.robot, str(r.seed), f"{r.duration:.2f}") for r in late),
-        "Some plans begin with a motion to another start posture; the duration includes this motion.",
+        "Some plans begin with a motion to another start posture. The duration includes this motion.",
     )
 
 
@@ -103,15 +102,15 @@ def _beside_the_tool(results: Sequence[PlacementResult]) -> Table:
             f"ratio of the medians (target: at most {_RATIO_TARGET:g})",
         ),
         tuple(rows),
-        "Whole arm: the path that the simulated arm executed. Tool alone: the path that ACFRA plans in the same scene "
-        "and between the same ends if only the spheres of the tool must keep the clearance. Both are compared with the "
-        "mean of the demonstrations as curves (200 points evenly spaced along the arc, matched by dynamic time "
-        "warping). Intervals: paired bootstrap over placements, 95 %.",
+        "Whole arm: the path that the simulated arm executed. Tool alone: the path that ACFRA plans in the same "
+        "scene between the same ends, if only the tool must keep the clearance. RMSE: distance between the path and "
+        "the mean of the demonstrations, at 200 points that are evenly spaced along each path and matched by dynamic "
+        "time warping. Intervals: paired bootstrap over placements, 95 %.",
     )
 
 
 def share(count: int, of: int) -> str:
-    """Return a count with its percentage and Wilson's 95 % interval as text; "-" if ``of`` is 0."""
+    """Return a text with a count, its percentage of ``of``, and the 95 % Wilson interval; "-" if ``of`` is 0."""
     if not of:
         return "-"
     low, high = wilson_interval(count, of)

@@ -1,7 +1,7 @@
-"""Test policies on a simulated arm with random obstacles on the path: count arrivals, refusals and contacts.
+"""Test policies with a simulated arm and random obstacles on the path: count arrivals, refusals and contacts.
 
-Each placement puts one to three obstacles on the learned path of a skill. Every policy reproduces the skill around
-these obstacles, with the same safety filter. The simulator measures clearance and contact with its own geometry.
+A placement is a scene with one to three obstacles on the learned path of a skill. Every policy reproduces the skill
+around these obstacles, with the same safety filter. The simulator measures clearance and contact with its own geometry.
 """
 
 from __future__ import annotations
@@ -46,9 +46,10 @@ from imitarm.trajectory import Rollout, Trajectory
 Array = NDArray[np.float64]
 
 OUTCOMES = ("arrived", "refused", "waited", "too near", "touched", "stopped")
-"""Possible outcomes of a placement: "arrived" (and kept the clearance), "refused" (before any motion), "waited" (the
-motion was not finished in time), "too near" (the motion was finished, but the arm came closer to an obstacle than
-permitted), "touched" (contact, including self-collision), and "stopped" (protective stop or other failure)."""
+"""Possible outcomes of a placement. "arrived": the arm reached the goal and kept the clearance. "refused": the policy
+refused the placement before any motion. "waited": the motion was not finished in time. "too near": the arm reached the
+goal, but came nearer to an obstacle than permitted. "touched": the arm touched an obstacle or itself. "stopped": a
+protective stop or another failure ended the motion."""
 
 CLEARANCE = 0.02  # [m] required
 _DT = 0.01  # [s]
@@ -60,17 +61,16 @@ _ALLOWANCE = 0.002  # [m] that ACFRA adds to the clearance when it plans for the
 
 
 def placement(skill: Skill, arm: ArmModel, seed: int, start: Array) -> Scene:
-    """Return a scene with one to three obstacles on the learned path; none touches the arm in its start posture.
+    """Return a scene with one to three obstacles on the learned path. No obstacle touches the arm in its start posture.
 
     Args:
         skill: the skill with the learned path.
-        arm: the arm; at the start and at the goal, its tool must not touch an obstacle.
-        seed: seed of the scene; every third seed gives a scene with one obstacle.
+        arm: the arm. At the start and at the goal, no obstacle touches its tool.
+        seed: seed of the scene, which also determines the number of obstacles: 1 + seed modulo 3.
         start: joint positions at the start, shape (n_joints,) [rad].
 
     Raises:
-        InputError: when no place for an obstacle is found that is far enough from the tool at the start and at the
-            goal.
+        InputError: when every place that was tried for an obstacle is too near to the start or to the goal.
     """
     rng = np.random.default_rng([31, seed])
     path = skill.generate()
@@ -83,7 +83,10 @@ def placement(skill: Skill, arm: ArmModel, seed: int, start: Array) -> Scene:
             chosen.append(obstacle)
         if len(chosen) == count:
             return Scene(None, tuple(chosen))
-    raise InputError(f"placement {seed}: no place for {count} obstacles between start and goal of {skill!r}")
+    raise InputError(
+        f"placement {seed}: no place for {count} obstacles between start and goal of {skill!r}; choose another seed, "
+        "or a skill with a longer path"
+    )
 
 
 def _start_clearance(arm: ArmModel, start: Array, obstacle: Obstacle) -> float:
@@ -102,11 +105,11 @@ def _end_clearance(skill: Skill, arm: ArmModel, obstacle: Obstacle) -> float:
 
 
 def run_placement(policy: str, setup: Setup, seed: int, max_tilt: float | None = None) -> PlacementResult:
-    """Let one policy reproduce a skill in one placement.
+    """Run one policy in one placement, and return the result.
 
     Args:
         policy: name in :data:`~imitarm.policies.POLICIES`.
-        setup: the skill and the arm.
+        setup: the skill to reproduce, and the arm.
         seed: seed of the placement.
         max_tilt: largest rotation of the tool away from the learned rotation [rad]; None: the policy's default.
 
@@ -154,15 +157,15 @@ def run_placement(policy: str, setup: Setup, seed: int, max_tilt: float | None =
 
 
 def tool_alone(setup: Setup, scene: Scene) -> float:
-    """Plan a path for the tool alone, between the start and the goal of the whole arm's path, and return its RMSE.
+    """Plan a path for the tool without the arm, between the same ends, and return the RMSE of this path.
 
     Args:
-        setup: the skill and the arm; only the arm's tool must keep the clearance, not its links.
+        setup: the skill and the arm. Only the tool of the arm must keep the clearance, not the links.
         scene: the obstacles.
 
     Returns:
-        The distance from the mean of the demonstrations, see :class:`~imitarm.evaluation.path_style.PathStyle` [m]; nan
-        if no path is found.
+        The RMS distance of the path from the mean of the demonstrations, see
+        :class:`~imitarm.evaluation.path_style.PathStyle` [m]; nan if no path is found.
     """
     arm = _prepared(setup)[1]
     found = adapt(_tool_path(setup), scene, tool_spheres=arm.tool_spheres, clearance=CLEARANCE, allowance=_ALLOWANCE)
@@ -179,7 +182,7 @@ def _tool_path(setup: Setup) -> ComponentPath:
 
 
 def _rotated(path: Trajectory, begins: Pose) -> Trajectory:
-    """Return a path with rotations; if none were learned, the tool keeps the rotation that it has at the start."""
+    """Return a path with rotations. If no rotations were learned, the tool keeps the rotation of ``begins``."""
     if path.quaternions is not None:
         return path
     return Trajectory(path.times, path.positions, np.tile(begins.quaternion, (len(path), 1)))
@@ -240,23 +243,23 @@ def run_placements(
     reuse: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[PlacementResult]:
-    """Run every policy in every placement; the results do not depend on the number of processes.
+    """Run every policy in every placement, and return the results. They do not depend on the number of processes.
 
     Args:
         policies: names in :data:`~imitarm.policies.POLICIES`.
         setups: skills, each with the arm that reproduces it.
         seeds: seeds of the placements.
         max_tilt: largest rotation of the tool away from the learned rotation [rad]; None: the policy's default.
-        jobs: processes.
-        out: file to which each result is appended as one line of JSON as soon as it is known. A result of the same
-            run and the same code that the file already contains is not measured again. None: results are not saved.
-        reuse: whether to keep results in ``out`` that another version of the code measured.
-        progress: function called with the number of finished placements and the total number.
+        jobs: number of processes.
+        out: file to which each result is appended as one line of JSON as soon as it is known. If the file already
+            contains a result of the same run by the same code, this run is not repeated. None: results are not saved.
+        reuse: whether to use results in ``out`` that another version of the code produced.
+        progress: function that is called after each run, with the number of finished runs and the number of all runs.
 
     Raises:
         InputError: when a skill or an arm can't be loaded, ``out`` can't be written, or ``jobs`` is above 1 and joblib
             is not installed.
-        FileFormatError: when ``out`` contains something else.
+        FileFormatError: when ``out`` contains something other than results.
     """
     work = [Run(policy, setup, seed, max_tilt) for setup in setups for seed in seeds for policy in policies]
     known: dict[Run, PlacementResult] = {}
@@ -290,7 +293,7 @@ def _joblib() -> Any:
 
 
 def packaged_skill(folder: Path) -> Path:
-    """Learn the skill 'sweep' of the package, save it in ``folder``, and return the file."""
+    """Learn the skill 'sweep' from the packaged demonstrations, save it in ``folder``, and return the file's path."""
     from imitarm.demonstrations import align, read  # noqa: PLC0415 (only here)
     from imitarm.tasks.sweep import DEMONSTRATIONS  # noqa: PLC0415 (only here)
 

@@ -1,4 +1,4 @@
-"""Find out which version of the code produced a result: the Git commit of a checkout, or the installed version."""
+"""Determine the version of the running code: the Git commit of a checkout, or the version of the installed package."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ _PACKAGE = Path(imitarm.__file__).parent
 
 @lru_cache(maxsize=1)
 def code_version() -> str:
-    """Return the version of the running code as text; the version is determined only once per process.
+    """Return the version of the running code as text. The version is determined only once per process.
 
-    In a Git checkout, this is the last commit that changed the package, so commits to documentation or tests do not
-    matter. Uncommitted changes of the package are identified by a hash of their text, so that results of two different
-    states of a working tree are never confused.
+    In a Git checkout, the version is the last commit that changed the package. Commits that change only documentation
+    or tests do not matter. If the package has uncommitted changes, the version also contains a hash of these changes.
+    Therefore two different states of the code never have the same version.
 
     Returns:
-        ``"commit 0123456789"``, ``"commit 0123456789 with uncommitted changes 01234567"``, or ``"version 0.1.0"`` when
-        the package is not in a checkout.
+        ``"commit 0123456789"`` or ``"commit 0123456789 with uncommitted changes 01234567"`` in a Git checkout;
+        otherwise ``"version 0.1.0"``.
     """
     return version_of(_PACKAGE, f"version {imitarm.__version__}")
 
@@ -49,16 +49,18 @@ def version_of(package: Path, installed: str) -> str:
 
 
 def origin(versions: Iterable[str]) -> str:
-    """Return a sentence that says which version of the code made the results, and whether the running code differs.
+    """Return a text that names the versions of the code that made the results.
+
+    It says whether the running code differs.
 
     Args:
-        versions: code version of each result, see :func:`code_version`.
+        versions: version of the code for each result, see :func:`code_version`.
     """
     found, now = sorted(set(versions)), code_version()
     if found == [now]:
         return f"Results of {now}."
     text = f"Results of {' and '.join(found) or 'no run'}"
-    changed = f"These tables were made by another version of the code ({now})"
+    changed = f"Another version of the code made these tables ({now})"
     return f"{text}. {changed}. Run the command again to update the results."
 
 

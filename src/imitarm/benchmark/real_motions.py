@@ -1,4 +1,4 @@
-"""``imitarm benchmark people``: retarget recordings of real people to simulated arms."""
+"""``imitarm benchmark people``: make simulated arms follow recorded motions of real people."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ _COLUMNS = (
     "distance to the target, RMS [mm]>",
     "lag [ms]>",
     "frames beyond a limit>",
-    "highest velocity, acceleration [% of the limit]>",
-    "smallest distance between links [mm]>",
-    "executed: largest joint error [mrad]>",
-    "executed: torque [% of the rated torque]>",
+    "highest joint velocity and acceleration [% of the limit]>",
+    "smallest distance between links of the arm [mm]>",
+    "largest joint error of the simulated arm [mrad]>",
+    "largest torque of the simulated arm [% of the rated torque]>",
 )
 _STRIDE = 10  # periods over which a hand's speed is measured: in one, most of it would be the camera's noise
 _VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")
@@ -58,11 +58,11 @@ class Motion(NamedTuple):
 
 
 def real_motions(data: Path, videos: Sequence[str] = ()) -> Iterator[Motion]:
-    """Read the recordings of real people.
+    """Yield the motions of real people, read from files.
 
     Args:
-        data: the folder of real recordings.
-        videos: videos or recordings of a person.
+        data: folder with the recordings ``kinect_gestures`` and ``mocap_arm``.
+        videos: further files: videos or skeleton recordings of a person whose left arm moves.
 
     Raises:
         InputError: when a file is missing or can't be read, or MediaPipe is needed but not installed.
@@ -86,7 +86,7 @@ def tables(motions: Sequence[Motion]) -> list[Table]:
     """Return two tables.
 
     The first table shows the method ``modern`` with every motion, arm and playback speed. The second table shows all
-    methods with the first motion only.
+    methods, with the first motion at half speed.
 
     Args:
         motions: at least one motion.
@@ -111,10 +111,16 @@ def tables(motions: Sequence[Motion]) -> list[Table]:
 
 
 class Start(NamedTuple):
-    """The input for retargeting a motion to an arm; from its start posture, the whole motion is within reach.
+    """The input for retargeting a motion to an arm.
 
-    The fields are the arm, the skeletons at the playback speed, the correspondence, the start posture (n_joints,)
-    [rad], and the highest speed of the target [m/s].
+    Scale and start posture are chosen so that the whole motion is within the reach of the arm.
+
+    Attributes:
+        arm: the arm with a gripper.
+        skeletons: the recorded skeletons at the playback speed.
+        follow: map from the person's motion to the robot's motion.
+        q: start posture, shape (n_joints,) [rad].
+        target_speed: highest speed of the robot's target [m/s].
     """
 
     arm: ArmModel

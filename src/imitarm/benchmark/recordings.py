@@ -1,4 +1,7 @@
-"""The recordings of the mapping benchmark, the same for all methods: simulated cameras record simulated people."""
+"""The recordings of the mapping benchmark: simulated cameras record simulated people.
+
+All methods use the same recordings.
+"""
 
 from __future__ import annotations
 
@@ -31,16 +34,15 @@ Array = NDArray[np.float64]
 KINDS = ("inside", "edge", "drawing", "stacking")
 """Kinds of recordings of simulated people.
 
-In "inside", the person reaches to points well inside the workspace. In "edge", the person also stretches the arm every
-few seconds, farther than the robot can reach. In "drawing", the person draws circles, eights and waves. In "stacking",
-the person stacks four cubes."""
+In "inside", the person reaches to points well inside the robot's workspace. In "edge", the person also stretches the
+arm every 4 s, so that the target is farther away than the robot can reach. In "drawing", the person draws circles,
+eights and waves. In "stacking", the person stacks four cubes."""
 CAPTURED = "captured"
-"""The kind of recording that needs real data: a simulated camera observes an arm that was recorded by motion
-capture."""
+"""The kind of recording that needs real data: a simulated camera observes a real arm that motion capture has
+recorded."""
 
 REPEATS = 100
-"""Largest number of recordings of one kind and person; a larger number would need seeds that belong to the next
-person."""
+"""Largest number of recordings of one kind and person. A larger number would reuse the seeds of the next person."""
 _LONGEST = 120.0  # [s] of a recording
 
 REACH = 0.80  # [m] from the Sawyer's shoulder to its wrist when it is stretched
@@ -55,17 +57,17 @@ _TRIES = 5  # trials of a person, until one stacks the tower with the ideal foll
 
 @dataclass(frozen=True)
 class Plan:
-    """The definition of a recording, as plain values.
+    """The definition of a recording, which contains only text and numbers.
 
     Attributes:
         kind: one of :data:`KINDS`, or :data:`CAPTURED`.
-        person: seed of the person; persons differ in limb lengths and habits.
-        repeat: number of the recording among the recordings of this person, 0 to 99. The number also seeds the motion
-            and the camera. For motion capture, it is the number of the simulated camera.
-        seconds: approximate duration of reaches and drawings [s]. Motion capture is cut to this duration; stacking
-            ignores it.
+        person: seed of the simulated person. The seed determines the lengths of the limbs and the habits of motion.
+        repeat: which recording of this person, from 0 to 99. The number also determines the random motion and the
+            camera's errors. For motion capture, it is the number of the simulated camera.
+        seconds: approximate duration of reaching and drawing motions, and largest duration of motion capture [s]. The
+            kind "stacking" ignores it.
         sigma: standard deviation of the camera's error [m]; None: 1 to 2 cm, chosen by the seed.
-        data: folder of real recordings, for :data:`CAPTURED`.
+        data: folder of real recordings; only for the kind :data:`CAPTURED`.
 
     Raises:
         UnknownNameError: when there is no such kind.
@@ -84,7 +86,8 @@ class Plan:
             raise UnknownNameError.among("kind of recording", self.kind, (*KINDS, CAPTURED))
         if self.person < 0 or not 0 <= self.repeat < REPEATS or not 4.0 <= self.seconds <= _LONGEST:
             raise InputError(
-                f"Plan: person must be at least 0, repeat 0 to {REPEATS - 1}, seconds 4 to {_LONGEST:g}; got {self}"
+                f"Plan: person must be at least 0, repeat from 0 to {REPEATS - 1}, and seconds from 4 to "
+                f"{_LONGEST:g}; got {self}"
             )
         if self.sigma is not None and not 0.0 <= self.sigma <= 0.1:
             raise InputError(f"Plan: sigma must be between 0 and 0.1 m, got {self.sigma!r}")
@@ -95,20 +98,22 @@ class Plan:
         return 10 * (REPEATS * self.person + self.repeat) + (*KINDS, CAPTURED).index(self.kind)
 
     def camera(self, number: int) -> SkeletonCamera:
-        """Return a camera with realistic errors."""
+        """Return a simulated camera with realistic errors; ``number`` is its seed."""
         return SkeletonCamera.from_seed(number) if self.sigma is None else SkeletonCamera(number, sigma=self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
 class MappingRecording:
-    """A recording: the input of the methods, and the true motion, which the methods do not see.
+    """A recording, and the true motion of the recorded person.
+
+    The methods receive only the skeletons, the correspondence and the start posture.
 
     Attributes:
         plan: the definition of the recording.
-        skeletons: skeletons measured by the camera.
-        correspondence: correspondence between person and robot for all methods.
+        skeletons: skeletons that the simulated camera measured.
+        correspondence: map from the person's motion to the robot's motion, which all methods use.
         start: start posture of the robot, shape (n_joints,) [rad].
-        true_times: times of the true positions, counted from the first skeleton, shape (m,) [s].
+        true_times: times of the true positions, shape (m,) [s]. Time 0 is the time of the first skeleton.
         true_points: true positions of shoulder, elbow, wrist, hand, hand tip and thumb, shape (m, 6, 3) [m], in the
             sensor's frame.
     """
@@ -121,16 +126,19 @@ class MappingRecording:
     true_points: Array
 
     def true_arm(self, times: Array) -> TrueArm:
-        """Return the person's true arm at times (n,) of a run [s].
+        """Return the true arm of the person at ``times``, shape (n,) [s], interpolated linearly.
 
-        Before the first and after the last recorded time, the arm is at rest.
+        Before the first and after the last recorded time, the arm has its first or last recorded position.
         """
         flat = self.true_points.reshape(len(self.true_times), -1)
         points = np.column_stack([np.interp(times, self.true_times, column) for column in flat.T])
         return TrueArm.from_points(times, points.reshape(-1, 6, 3), self.correspondence)
 
     def save(self, path: Path) -> None:
-        """Write the recording to a file of arrays, without executable code; a failure leaves no incomplete file."""
+        """Write the recording to a NumPy file (.npz) without executable code.
+
+        A failure never leaves an incomplete file.
+        """
         c, lengths = self.correspondence, self.correspondence.lengths
         assert lengths is not None
         aside = path.with_name(f".{path.name}.{np.random.default_rng().integers(1 << 62):x}.part")
@@ -155,7 +163,7 @@ class MappingRecording:
 
     @classmethod
     def load(cls, path: Path, plan: Plan) -> MappingRecording:
-        """Read a file that :meth:`save` wrote."""
+        """Read a recording from a file that :meth:`save` wrote."""
         with np.load(path, allow_pickle=False) as file:
             seen = zip(file["times"], file["positions"], file["tracking"], file["hands"], strict=True)
             skeletons = tuple(Skeleton(t, p, k, (HandState(left), HandState(right))) for t, p, k, (left, right) in seen)
@@ -169,15 +177,15 @@ class MappingRecording:
 
 
 def make_recording(plan: Plan, arm: ArmModel) -> MappingRecording:
-    """Make a recording; the same plan always gives the same recording.
+    """Make a recording. The same plan always gives the same recording.
 
     Args:
         plan: the definition of the recording.
-        arm: the robot that will follow the recording.
+        arm: the robot that will follow the recording; determines the start posture.
 
     Raises:
         InputError: when the recording needs real data that are missing.
-        TaskFailedError: when the person can't stack the cubes even with an ideal gripper that moves exactly with the
+        TaskFailedError: when the person can't stack the cubes even with an ideal gripper, which moves exactly like the
             hand.
     """
     person = Person.from_seed(plan.person)
@@ -210,7 +218,10 @@ def _scale(plan: Plan, person: Person) -> float:
 
 
 def _start(plan: Plan, arm: ArmModel, points: Array) -> Array:
-    """Return the start posture: for stacking, the task's own; otherwise, one that matches the person's first wrist."""
+    """Return the start posture of the robot.
+
+    For stacking, the task defines it. Otherwise it matches the person's first wrist position.
+    """
     if plan.kind == "stacking":
         return StackTask().start_posture(arm)
     s, e, w = FACING.apply(points[:3])
@@ -257,7 +268,10 @@ def _stacking(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
         done = run_stack(plan.person, plan.repeat + REPEATS * k, IdealFollower, camera=ideal_camera)
         if done.success:
             return _between(done.truth), done.truth[-1].time, "fixed"
-    raise TaskFailedError(f"person {plan.person} did not stack the tower in {_TRIES} trials with the ideal gripper")
+    raise TaskFailedError(
+        f"person {plan.person} did not stack the tower in {_TRIES} trials, although the gripper moved exactly like "
+        "the hand; choose another person"
+    )
 
 
 def _captured(plan: Plan, person: Person) -> tuple[Truth, float, Orientation]:
@@ -309,8 +323,8 @@ def _between(frames: tuple[Skeleton, ...]) -> Truth:
 def beyond_reach(recording: MappingRecording, arm: ArmModel) -> float:
     """Return the fraction of the time in which the target of the robot's wrist is beyond the reach of the arm.
 
-    The target is the start position plus the scaled displacement of the person's wrist. The tool is assumed to keep its
-    orientation.
+    The target is the start position of the robot's wrist plus the scaled displacement of the person's wrist. The
+    function assumes that the tool keeps its orientation.
 
     Raises:
         InputError: when the arm's file does not define shoulder and wrist.

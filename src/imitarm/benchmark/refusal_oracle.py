@@ -1,21 +1,21 @@
-"""An oracle that checks refusals of ``adapt``: it decides whether a path around the obstacles exists.
+"""An oracle that checks the refusals of ``adapt``: it decides whether a path around the obstacles exists.
 
-The oracle shares no code with the library's search for a path. The oracle gives one of three answers:
+The oracle does not use the library's search for a path. It gives one of three answers:
 
 * **impossible**: the oracle proved that no continuous displacement of the path avoids the obstacles. Either an obstacle
-  covers a point that must not move, or no chain of unblocked boxes in space and time leads from the start to the
-  goal (:mod:`imitarm.benchmark.refusal_proof`).
-* **possible**: the oracle found and verified a path. It searches in two ways. The first looks for a chain of free boxes
-  from the start to the goal. The second uses a grid of displacements at many times, called layers, and looks for a
-  chain of free cells. A cell of the grid counts as free if its centre is free. For moves between neighbouring cells and
-  between layers, tangents give a lower bound of the distance to the obstacles. Dynamic programming finds the chain with
-  the smallest displacements. A sum of the skill's components is then fitted to the chain. If the components are too
-  wide for the fit, the sum uses hat functions of time instead.
-* **undecided**: with the finest grid and the smallest boxes, the oracle found neither a proof nor a path.
+  covers a point that must not move, or every sequence of boxes in space and time from the start to the goal is blocked
+  (:mod:`imitarm.benchmark.refusal_proof`).
+* **possible**: the oracle found and verified a path. It searches in two ways. The first search looks for a sequence of
+  free boxes from the start to the goal. The second search uses a grid of displacements at many times, called layers. A
+  cell of the grid is free if an obstacle is far enough from its centre. A move between two cells is free if a lower
+  bound of the distance to the obstacles, computed from tangents, is large enough. Dynamic programming finds the
+  sequence of free cells with the smallest displacements. The oracle then approximates this sequence by a sum of the
+  skill's components. If the components are too wide, it uses hat functions of time instead.
+* **undecided**: the oracle found no proof and no path, even with its finest grid and its largest number of boxes.
 
-The oracle uses the same limits as the library's own search. No sample is displaced by more than 0.5 m. No step is
-longer than 8 times the longest step of the nominal path. At fixed times, the path is not displaced. No displacement has
-a component in a forbidden direction.
+The oracle keeps the same limits as the library's search. No sample of the path is displaced by more than 0.5 m. No step
+is longer than 8 times the longest step of the nominal path. At fixed times (start, goal and pinned times), the path is
+not displaced. No displacement has a component in a forbidden direction.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ def answer(question: Question) -> Answer:
 
 
 def decide(question: Question) -> tuple[Answer, Array | None]:
-    """Decide whether a path exists, and return the answer with the positions (n, 3) [m] of the path, if one was found.
+    """Decide whether a path exists; return the answer, and the positions of the path, shape (n, 3) [m], or None.
 
-    The path has the times of ``question.nominal``.
+    The positions belong to the times of ``question.nominal``. They are None if no path was found.
     """
     if covers_fixed_point(question):
         return Answer.IMPOSSIBLE, None
@@ -68,7 +68,7 @@ def decide(question: Question) -> tuple[Answer, Array | None]:
 
 
 def is_solved(question: Question) -> bool:
-    """Return whether the oracle finds and verifies a path."""
+    """Return whether the oracle finds a path and verifies its clearance."""
     return _searched(question)[0] is Answer.POSSIBLE
 
 

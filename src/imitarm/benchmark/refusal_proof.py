@@ -1,18 +1,18 @@
-"""Proof that no path exists: a graph of cells, which are divided only where a path may still pass.
+"""Prove that no path exists, by a search in a graph of cells in space and time.
 
-A *cell* is a box of positions of the tool's tip, together with an interval of time. A cell is blocked only if no
-position in the box is possible at any time in the interval. A cell can be blocked for two reasons. One inflated
-obstacle may contain the centre of the tool's sphere all the time. Or every position in the box may be displaced too far
-or in a forbidden direction. An inflated obstacle is convex, so it contains a box if it contains the corners of the box.
-The proof therefore tests only the corners of the box that contains the sphere's centre at all times of the interval. A
-cell is free if it is proved that nothing blocks any part of it.
+A *cell* is a box of positions of the tool's tip, together with an interval of time. A cell is *blocked* if the tip
+cannot be at any position of the box at any time of the interval. There are two reasons why a cell can be blocked.
+First, an inflated obstacle may contain the centre of one of the tool's spheres during the whole interval. An inflated
+obstacle is convex, so it contains a box if it contains the corners of the box. The proof therefore tests only the
+corners of the box in which the sphere's centre stays during the interval. Second, all positions of the box may be
+displaced too far or in a forbidden direction. A cell is *free* if it is proved that every position is possible at every
+time of the interval. All other cells are *undecided*.
 
-Two cells are neighbours if they have a position and a time in common. A path leads from cell to neighbouring cell, and
-never back in time. If the graph of all cells that are not blocked contains no route from the start to the goal, then no
-continuous displacement keeps the path clear of the obstacles. A cell is undecided if it is neither blocked nor free.
-Each round finds the routes that cross the fewest undecided cells, and divides these cells. Cells to which no route
-leads are left out. If a route of free cells is found, the search ends: a path exists, although its speed may exceed the
-limit.
+Two cells are neighbours if they have a position and a time in common. A route leads from cell to neighbouring cell, and
+never back in time. If no route through cells that are not blocked leads from the start to the goal, no path avoids the
+obstacles. In each round, the search finds the routes that cross the fewest undecided cells, and divides these cells. It
+drops cells that no route can reach. If the search finds a route of free cells, a path exists, although its speed may
+exceed the limit.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _MAX_FRAMES = 3
 
 
 class Answer(Enum):
-    """Possible answers to the question of whether a path exists."""
+    """Possible answers to the question whether a path exists."""
 
     IMPOSSIBLE = "impossible"
     POSSIBLE = "possible"
@@ -58,10 +58,10 @@ class Exploration:
     """Result of the search for a proof or a route.
 
     Attributes:
-        answer: POSSIBLE if a route of free cells was found, IMPOSSIBLE if the search proved that no path exists,
+        answer: POSSIBLE if the search found a route of free cells; IMPOSSIBLE if it proved that no path exists;
             otherwise UNDECIDED.
         route: times (m,) [s] and positions (m, 3) [m] of a path through free cells; None if no such path was found. The
-            path keeps every limit except, possibly, the limit of speed.
+            path may exceed the limit of speed, but keeps all other limits.
     """
 
     answer: Answer
@@ -72,9 +72,10 @@ def explored(question: Question, *, timed: bool) -> Exploration:
     """Prove that no path exists, or find a route through free cells.
 
     Args:
-        question: scene and path; at least one direction of displacement is permitted.
-        timed: whether cells are also divided in time. If False, every cell lasts for a whole leg. The search is then
-            fast, and finds an answer in most scenes in which only the tip moves.
+        question: scene and path. At least one direction of displacement must be permitted.
+        timed: whether cells are also divided in time. If False, every cell covers all times between two fixed times of
+            the path. This search is faster, and finds an answer in most scenes without moving obstacles or rotations of
+            the tool.
     """
     found = Exploration(Answer.UNDECIDED)
     for frame in _frames(question, question.axes()):
@@ -115,7 +116,7 @@ def _aligned(rotation: Array, axes: Array) -> Array:
 
 
 def _explored(leg: Leg, *, timed: bool) -> Exploration:
-    """Divide cells until no route is left, or a route of free cells is found, or there are too many cells."""
+    """Divide cells until there is no route, a route of free cells is found, or there are too many cells."""
     cells, blocked = _root(leg, timed=timed)
     if blocked.any():
         return Exploration(Answer.IMPOSSIBLE)
@@ -147,7 +148,7 @@ def _root(leg: Leg, *, timed: bool) -> tuple[Cells, Bools]:
 
 
 def _refined(leg: Leg, cells: Cells, edges: Index, graph: _Graph, *, timed: bool) -> tuple[Cells, Index]:
-    """Divide the wanted cells, and leave out those that are blocked or that no route leads through."""
+    """Divide the wanted cells; drop the halves that are blocked and the cells through which no route leads."""
     kept, split = np.flatnonzero(graph.alive & ~graph.wanted), np.flatnonzero(graph.wanted)
     pieces, blocked = classified(leg, cells.take(split).halves(), timed=timed)
     stays = np.flatnonzero(~blocked)
@@ -174,7 +175,7 @@ class _Graph:
 
     Attributes:
         alive: whether a route leads through the cell, shape (n,).
-        wanted: whether the cell is to be divided, shape (n,).
+        wanted: whether the cell should be divided next, shape (n,).
         is_free: whether a route leads through free cells only.
     """
 
@@ -230,13 +231,14 @@ class Cells:
     """Boxes of positions, each with an interval of time.
 
     Attributes:
-        low: lowest coordinates, shape (n, d) [m].
-        high: highest coordinates, shape (n, d) [m].
-        level: level of the interval, shape (n,); an interval of this level is as long as the leg divided by 2^level.
-        at: number of the interval among the 2^level intervals of its level, shape (n,).
-        depth: how many times the cell's ancestors were divided, shape (n,).
-        free: whether the cell is certainly free, shape (n,).
-        axis: index of the axis along which the cell is divided next, shape (n,); the index d stands for time.
+        low: smallest coordinates of each box, shape (n, d) [m].
+        high: largest coordinates of each box, shape (n, d) [m].
+        level: how many times the interval of time was halved, shape (n,). The interval is as long as the leg divided by
+            2^level.
+        at: index of the interval among the 2^level intervals of its level, shape (n,).
+        depth: number of divisions that led to the cell, shape (n,).
+        free: whether the cell is proved to be free, shape (n,).
+        axis: index of the axis along which the cell will be divided next, shape (n,); the index d stands for time.
     """
 
     low: Array
@@ -264,12 +266,15 @@ class Cells:
         return Cells(**{name: np.concatenate([values, getattr(other, name)]) for name, values in vars(self).items()})
 
     def times(self) -> tuple[Array, Array]:
-        """Return start and end of each interval, as fractions of the leg, each of shape (n,)."""
+        """Return the start and the end of each cell's interval, shape (n,) each, as fractions of the leg."""
         length = 0.5**self.level
         return self.at * length, (self.at + 1) * length
 
     def touch(self, i: Index, j: Index) -> Bools:
-        """Return, for each pair of cells, whether the two cells have a position and a time in common, shape (m,)."""
+        """Return whether the cells of each pair have a position and a time in common, shape (m,).
+
+        ``i`` and ``j`` are the indices of the m pairs.
+        """
         start, end = self.times()
         answer = (start[i] <= end[j]) & (start[j] <= end[i])
         for low, high in zip(self.low.T, self.high.T, strict=True):
@@ -277,13 +282,16 @@ class Cells:
         return np.asarray(answer)
 
     def contain(self, position: Array, time: float) -> Index:
-        """Return the cells that contain a position (d,) [m] at a time, given as a fraction of the leg."""
+        """Return the indices of the cells that contain a position, shape (d,) [m], at a time.
+
+        The time is a fraction of the leg.
+        """
         start, end = self.times()
         inside = np.all((self.low - _TOUCH <= position) & (position <= self.high + _TOUCH), axis=1)
         return np.flatnonzero(inside & (start <= time) & (time <= end))
 
     def halves(self) -> Cells:
-        """Return the 2 n halves of the cells: first all lower or earlier halves, then all others."""
+        """Return the 2 n halves of the cells. The first n are the lower (or earlier) halves of the cells."""
         d, rows = self.low.shape[1], np.arange(len(self))
         low, high = np.concatenate([self.low, self.low]), np.concatenate([self.high, self.high])
         level, at = np.tile(self.level, 2), np.tile(self.at, 2)
@@ -341,13 +349,12 @@ class _Choice:
 
 
 def classified(leg: Leg, cells: Cells, *, timed: bool) -> tuple[Cells, Bools]:
-    """Find out which cells are blocked, which are free, and along which axis to divide them.
+    """Determine which cells are blocked, which cells are free, and along which axis to divide each cell.
 
     Args:
-        leg: obstacles, limits and motion.
+        leg: obstacles, limits and undisplaced motion between two fixed times.
         cells: new cells.
-        timed: whether cells may be divided in time. If False, a limit is ignored if it blocks the cell only at some
-            times.
+        timed: whether cells may be divided in time. If False, a limit counts only if it blocks the cell at all times.
 
     Returns:
         The cells, and whether each cell is blocked, shape (n,).

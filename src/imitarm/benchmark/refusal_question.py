@@ -1,4 +1,4 @@
-"""The question whether a path exists in a scene, in the form that the oracle of refusals uses."""
+"""The question whether a path exists in a scene, as the oracle of refusals needs it."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ _ROUNDING = 1e-9  # [m]
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """The question of whether a path exists in a scene, in the form that the oracle takes.
+    """The question whether a path exists in a scene. Contains everything that the oracle must know.
 
     Attributes:
-        nominal: the nominal path, with n samples.
-        basis: influence of the skill's components on the samples, shape (n, n_components).
-        obstacles: the obstacles at time 0 s; each obstacle moves with constant velocity.
+        nominal: the learned path without displacement, with n samples.
+        basis: influence of each component of the skill on each sample, shape (n, n_components).
+        obstacles: the obstacles at time 0 s. Each obstacle moves at its constant velocity.
         spheres: spheres that cover the tool, rows x y z radius in the tool's frame, shape (m, 4) [m].
         clearance: required clearance [m].
         forbidden: directions in which the path must not be displaced, shape (k, 3).
@@ -44,7 +44,10 @@ class Question:
     fixed_times: tuple[float, ...]
 
     def at(self, times: Array) -> tuple[Array, Array]:
-        """Return positions of the tip (m, 3) at ``times``, and sphere centres relative to it (n_spheres, m, 3) [m]."""
+        """Return the positions of the tip at ``times``, shape (m, 3) [m], and the relative positions of the spheres.
+
+        These are the vectors from the tip to the centre of each sphere of the tool, shape (n_spheres, m, 3) [m].
+        """
         tip, quaternions = self.nominal.at(times)
         if quaternions is None:
             return tip, np.zeros((len(self.spheres), len(times), 3))
@@ -52,7 +55,7 @@ class Question:
         return tip, np.stack([rotate(rotations, np.broadcast_to(s[:3], (len(times), 3))) for s in self.spheres])
 
     def axes(self) -> Array:
-        """Return an orthonormal basis (d, 3) of the permitted displacements."""
+        """Return d orthonormal vectors that span the permitted displacements, shape (d, 3)."""
         if not len(self.forbidden):
             return np.eye(3)
         unit = self.forbidden / np.linalg.norm(self.forbidden, axis=1, keepdims=True)
@@ -67,13 +70,13 @@ def separation(question: Question, times: Array, positions: Array) -> float:
     """Return a proven lower bound of the clearance along a path, minus the required clearance [m].
 
     For any unit vector u, a point p is at least ``u . p - max_x u . x`` away from a convex obstacle. The maximum over
-    all points x of the obstacle is its support function. The proof uses no other geometry of the library, except that
-    the library's distance gradient proposes the vector u. Every u gives a valid bound.
+    all points x of the obstacle is the obstacle's support function. The proof uses only this function. The gradient of
+    the library's distance function proposes u, but the bound is valid for every u.
 
     Args:
         question: obstacles, spheres and clearance.
         times: times of the path [s], shape (n,).
-        positions: positions of the tip at these times, the corners of a polyline, shape (n, 3) [m].
+        positions: positions of the tip at these times, connected by straight segments, shape (n, 3) [m].
     """
     dense = np.unique(np.concatenate([np.linspace(times[0], times[-1], _DENSE), times]))
     tip = np.stack([np.interp(dense, times, column) for column in positions.T], axis=1)
@@ -90,7 +93,10 @@ def separation(question: Question, times: Array, positions: Array) -> float:
 
 
 def covers_fixed_point(question: Question) -> bool:
-    """Return whether an obstacle is too close to the tool at a fixed time, where the path may not be displaced."""
+    """Return whether an obstacle is too close to the tool at a fixed time.
+
+    The path must not be displaced at this time.
+    """
     times = np.asarray(question.fixed_times)
     tip, relative = question.at(times)
     for obstacle in question.obstacles:
@@ -102,25 +108,25 @@ def covers_fixed_point(question: Question) -> bool:
 
 
 class Leg:
-    """The part of the motion between two neighbouring fixed times; at a fixed time, the tip must not be displaced.
+    """The part of the motion between two successive fixed times. At a fixed time, the tip must not be displaced.
 
-    The coordinates of a position are its components along ``frame``: first the d permitted directions, then the others.
-    The tip is displaced only along the d permitted directions. Everything else that moves is known: the tip along the
-    other directions, the spheres relative to the tip, and the obstacles. A table contains a box for each interval of
-    time and each pair of an obstacle and a sphere. The box bounds the known motion of the sphere relative to the
-    obstacle. Level l of the table divides the leg into 2^l intervals.
+    The coordinates of a position are its components along the vectors of ``frame``. The first d vectors are the
+    permitted directions, along which the search may displace the tip. The rest of the motion is known: the tip along
+    the other vectors, the tool's spheres relative to the tip, and the obstacles. A table bounds this known motion. For
+    each interval of time, and each pair of an obstacle and a sphere, the table contains a box. The box contains the
+    known part of the sphere's motion relative to the obstacle. Level l of the table divides the leg into 2^l intervals.
 
     Args:
         question: scene and path.
-        axes: orthonormal basis of the permitted displacements, shape (d, 3).
-        start: first time of the leg [s].
-        end: last time of the leg [s].
+        axes: orthonormal vectors that span the permitted displacements, shape (d, 3).
+        start: fixed time at which the leg begins [s].
+        end: fixed time at which the leg ends [s].
 
     Attributes:
         dimension: number d of permitted directions.
-        frame: unit vectors as rows, first the permitted directions, shape (3, 3).
-        pairs: for each pair of an obstacle and a sphere, the obstacle and the distance that the sphere's centre must
-            keep from it [m].
+        frame: three orthonormal vectors as rows, shape (3, 3). The first d rows are the permitted directions.
+        pairs: for each pair of an obstacle and a sphere of the tool: the obstacle, and the distance that the sphere's
+            centre must keep from this obstacle [m].
         ends: coordinates of the tip at the start and at the end of the leg, shape (2, d) [m].
         one_sided: components of the forbidden directions along the permitted axes, shape (m, d).
     """
@@ -155,29 +161,41 @@ class Leg:
         self.one_sided = slopes[np.linalg.norm(slopes, axis=1) > 1e-9]
 
     def positions(self, coordinates: Array, times: Array) -> Array:
-        """Return positions (m, 3) [m] of the tip from coordinates (m, d) [m]; ``times`` (m,) are parts of the leg."""
+        """Return the positions of the tip, shape (m, 3) [m], from its coordinates, shape (m, d) [m].
+
+        The times, shape (m,), are fractions of the leg.
+        """
         tip = self._question.at(self.start + times * (self.end - self.start))[0]
         axes = self.frame[: self.dimension]
         return np.asarray(tip + (coordinates - tip @ axes.T) @ axes)
 
     def nominal(self) -> tuple[Array, Array]:
-        """Return the times (n,) of the samples, as fractions of the leg, and the undisplaced coordinates (n, d) [m]."""
+        """Return the times and the undisplaced coordinates of the samples.
+
+        The times, shape (n,), are fractions of the leg. The coordinates have the shape (n, d) [m].
+        """
         samples = self._question.nominal.times
         samples = np.concatenate([[self.start], samples[(samples > self.start) & (samples < self.end)], [self.end]])
         tip = self._question.at(samples)[0]
         return (samples - self.start) / (self.end - self.start), tip @ self.frame[: self.dimension].T
 
     def tip_box(self, level: Index, at: Index) -> tuple[Array, Array]:
-        """Return the box of the undisplaced tip in n intervals of time: lowest and highest coordinates (n, d) [m]."""
+        """Return the smallest and the largest coordinates of the undisplaced tip in n intervals of time.
+
+        Each array has the shape (n, d) [m].
+        """
         return _looked_up(self._tip[0], level, at), _looked_up(self._tip[1], level, at)
 
     def motion_box(self, level: Index, at: Index) -> tuple[Array, Array]:
-        """Return the boxes of the known motion in n intervals: lowest and highest corners (n, n_pairs, 3) [m]."""
+        """Return the smallest and the largest corners of the boxes of the known motion in n intervals.
+
+        Each array has the shape (n, n_pairs, 3) [m].
+        """
         return _looked_up(self._motion[0], level, at), _looked_up(self._motion[1], level, at)
 
 
 def _bows(question: Question) -> Array:
-    """Return how far each sphere's centre moves away from straight lines between samples, at most, (n_spheres,) [m]."""
+    """Return how far each sphere's centre moves away from straight lines between samples, (n_spheres,) [m]."""
     arms, quaternions = np.linalg.norm(question.spheres[:, :3], axis=1), question.nominal.quaternions
     if quaternions is None:
         return np.zeros(len(arms))

@@ -1,4 +1,4 @@
-"""Paths along a route through free cells: where the path crosses from cell to cell, and when."""
+"""Make a path along a route of free cells: choose where and when the path crosses from cell to cell."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ _STEADY = 4.0  # weight of squared steps beside squared displacements
 
 
 def short(start: Array, end: Array, low: Array, high: Array) -> Array:
-    """Return points (m + 2, d) from ``start`` to ``end`` with the least sum of squared steps.
+    """Return m + 2 points from ``start`` to ``end`` with the least sum of squared steps, shape (m + 2, d) [m].
 
-    The m points between the ends are inside boxes with the corners ``low`` and ``high``, both of shape (m, d).
+    Each of the m points between the ends is inside its box. ``low`` and ``high`` are the corners of the boxes, shape
+    (m, d).
     """
     m = len(low)
     chain = 2.0 * np.eye(m) - np.eye(m, k=1) - np.eye(m, k=-1)
@@ -34,9 +35,9 @@ def short(start: Array, end: Array, low: Array, high: Array) -> Array:
 
 
 def even(points: Array, earliest: Array, latest: Array) -> Array:
-    """Return times (m + 2,) from 0 to 1 at which a path passes the points, at a speed as even as possible.
+    """Return the times, from 0 to 1, at which a path should pass m + 2 points so that its speed is as even as possible.
 
-    The path passes each of the m points between the ends at a time from ``earliest`` to ``latest``, both of shape (m,).
+    ``earliest`` and ``latest``, shape (m,), limit the times of the m points between the ends.
     """
     m = len(points) - 2
     earliest = np.maximum.accumulate(earliest)
@@ -57,11 +58,11 @@ def even(points: Array, earliest: Array, latest: Array) -> Array:
 
 
 def beside(route: Array, times: Array, nominal: Array) -> tuple[Array, Array]:
-    """Return a path along a route that stays near the nominal path at all times.
+    """Return a path that follows a route and stays as near to the nominal path as possible at all times.
 
     For each sample, dynamic programming chooses a point of the route. The cost is the sum of the squared displacements
     from the nominal path, plus the weighted squared steps along the route. The path never goes backwards on the route,
-    and no step is longer than permitted.
+    and keeps the permitted length of a step.
 
     Args:
         route: corners of a polyline, shape (m, d) [m].
@@ -69,8 +70,8 @@ def beside(route: Array, times: Array, nominal: Array) -> tuple[Array, Array]:
         nominal: nominal path at the samples, shape (n, d) [m].
 
     Returns:
-        Times (n,) and points (n, d) [m] of the path. If no such path reaches the end in time, the path follows the
-        route at constant speed.
+        Times (n,) and points (n, d) [m] of the path. If the permitted steps are too short to reach the end, the path
+        follows the route at constant speed.
     """
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(route, axis=0), axis=1))])
     at = np.linspace(0.0, length[-1], _POINTS)
@@ -96,6 +97,9 @@ def beside(route: Array, times: Array, nominal: Array) -> tuple[Array, Array]:
 
 
 def at_samples(nominal: Trajectory, times: Array, positions: Array) -> tuple[Array, Array]:
-    """Sample a polyline of ``positions`` at the nominal times; return these times (n,) and displacements (n, 3) [m]."""
+    """Interpolate ``positions`` at the times of the nominal path.
+
+    Return these times, shape (n,), and the displacements from the nominal path, shape (n, 3) [m].
+    """
     moved = np.stack([np.interp(nominal.times, times, column) for column in positions.T], axis=1)
     return nominal.times, moved - nominal.positions

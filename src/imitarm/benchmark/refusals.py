@@ -1,8 +1,8 @@
-"""``imitarm benchmark refusals``: let ``adapt`` plan in random scenes, and check its paths and refusals.
+"""``imitarm benchmark refusals``: plan paths with ``adapt`` in random scenes, and check the paths and the refusals.
 
 Some scenes have no solution. The obstacles, the tool, the required clearance, the forbidden directions and the number
-of samples are all random. The scenes therefore include unusual cases. An oracle,
-:mod:`imitarm.benchmark.refusal_oracle`, decides independently whether a path exists.
+of samples are all random. The scenes therefore include unusual cases. An independent oracle
+(:mod:`imitarm.benchmark.refusal_oracle`) decides whether a path exists.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ _COLUMNS = ("scenes", "accepted>", "violations>", "oracle solves>", "refused>", 
 
 @dataclass(frozen=True, eq=False)
 class RandomScene:
-    """One random scene, with all arguments that :func:`imitarm.policies.adapt` needs besides the skill.
+    """One random scene: all arguments of :func:`imitarm.policies.adapt` except the skill.
 
     Attributes:
         seed: number of the scene.
-        family: name of the rule by which the obstacles were placed.
+        family: name of the rule that placed the obstacles.
         scene: obstacles, some of which may move.
         tool_spheres: spheres that cover the tool, rows x y z radius in the tool's frame, shape (m, 4) [m].
         clearance: required clearance [m].
@@ -74,8 +74,8 @@ def random_scene(seed: int, path: Array, duration: float, *, rotates: bool) -> R
     Args:
         seed: number of the scene.
         path: nominal path, shape (n, 3) [m].
-        duration: duration of the path [s].
-        rotates: whether the skill rotates the tool. If False, all spheres of the tool are centred at the tip.
+        duration: time in which the tool follows the path [s].
+        rotates: whether the skill rotates the tool. If False, the centres of all spheres of the tool are at the tip.
     """
     rng = np.random.default_rng([31, seed])
     family = RANDOM_FAMILIES[int(rng.choice(len(RANDOM_FAMILIES), p=[0.1, 0.1, 0.3, 0.12, 0.06, 0.06, 0.16, 0.1]))]
@@ -249,17 +249,16 @@ _MAKERS = {
 
 @dataclass(frozen=True)
 class Verdict:
-    """Result of one scene.
+    """Result of ``adapt`` and of the oracle in one scene.
 
     Attributes:
         seed: number of the scene.
-        family: name of the rule by which the obstacles of the scene were placed.
-        accepted: whether the library found a feasible adaptation.
-        margin: proven lower bound of the clearance of an accepted path, minus the required clearance [m]; nan if
-            refused.
-        oracle: the oracle's answer to the question whether a path exists. If ``accepted``, the answer is "possible" or
-            "undecided", because the oracle then does not try to prove that no path exists.
-        seconds: compute time of the adaptation [s].
+        family: name of the rule that placed the obstacles of the scene.
+        accepted: whether ``adapt`` returned a path that can be executed.
+        margin: proven lower bound of the path's clearance, minus the required clearance [m]; nan if ``adapt`` refused.
+        oracle: the oracle's answer to the question whether a path exists. If ``accepted`` is True, the oracle only
+            searches for a path, so the answer is "possible" or "undecided".
+        seconds: computing time of ``adapt`` [s].
     """
 
     seed: int
@@ -276,7 +275,7 @@ class Verdict:
 
 
 def skills_to_adapt(files: Sequence[Path] = ()) -> list[Skill]:
-    """Return the skills of the benchmark: an S-shaped reach, the packaged sweep, and skills from files."""
+    """Return the skills of the benchmark: an S-shaped reach, the packaged sweep, and the skills in ``files``."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of one demonstration or of an axis that does not move: no matter here
         packaged = Skill(n_components=12).fit(align(read(DEMONSTRATIONS)))
@@ -284,13 +283,13 @@ def skills_to_adapt(files: Sequence[Path] = ()) -> list[Skill]:
 
 
 def scene_for(skill: Skill, seed: int) -> RandomScene:
-    """Return random scene ``seed`` around the path of a skill."""
+    """Return the random scene with number ``seed`` around the path of a skill."""
     path = skill.gmr_.trajectory(400).positions
     return random_scene(seed, path, skill.duration_, rotates=skill.gmr_.has_orientation_)
 
 
 def question_of(skill: Skill, case: RandomScene | StaticCase) -> Question:
-    """Return a scene in the form that the oracle uses."""
+    """Return a scene and a skill as a question for the oracle."""
     path = ComponentPath.of_skill(skill, n_samples=case.n_samples, pinned=case.pinned)
     forbidden = np.array(case.forbidden, dtype=float).reshape(-1, 3)
     return Question(
@@ -305,7 +304,7 @@ def question_of(skill: Skill, case: RandomScene | StaticCase) -> Question:
 
 
 def adapted(skill: Skill, case: RandomScene | StaticCase) -> Adaptation:
-    """Adapt a skill to a scene."""
+    """Adapt the path of a skill to a scene."""
     return adapt(
         skill,
         case.scene,
@@ -318,7 +317,7 @@ def adapted(skill: Skill, case: RandomScene | StaticCase) -> Adaptation:
 
 
 def evaluate_scene(skill: Skill, seed: int) -> Verdict:
-    """Adapt a skill to one random scene, and let the oracle check the path or the refusal."""
+    """Adapt a skill to one random scene, and check the path or the refusal."""
     case = scene_for(skill, seed)
     adaptation = adapted(skill, case)
     question = question_of(skill, case)
@@ -337,13 +336,14 @@ def refusal_table(
     files: Sequence[Path] = (),
     on_done: Callable[[int, int], None] | None = None,
 ) -> tuple[Table, list[Verdict]]:
-    """Adapt the skills, one after the other, to random scenes, and count the results.
+    """Adapt skills to random scenes, and count the results. Successive scenes use the skills in turn.
 
     Args:
-        n_scenes: how many.
+        n_scenes: number of scenes.
         first: seed of the first scene.
-        files: skill files used in addition to the two packaged skills.
-        on_done: function called with the number of finished scenes and the total number.
+        files: skill files that are used in addition to the two skills of the benchmark.
+        on_done: function that is called after each scene, with the number of finished scenes and the number of all
+            scenes.
     """
     skills = skills_to_adapt(files)
     verdicts = []

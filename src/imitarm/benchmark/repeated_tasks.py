@@ -1,4 +1,4 @@
-"""Repeat a task among moving obstacles with many seeds: packing, and sweeping while a cube is pushed about."""
+"""Repeat a simulated task among moving obstacles with many seeds: packing, or sweeping while a cube is pushed about."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class RepeatedTask(NamedTuple):
 
     Attributes:
         title: title of the table.
-        arm: function that loads the arm.
-        run: function that runs the task with a seed, an arm and the name of an observer.
-        observers: names of the sensor models that can observe the obstacles.
+        arm: function that loads the arm of the task.
+        run: function that runs the task once. Its arguments are a seed, an arm and the name of an observer.
+        observers: names of the observers, which are models of the sensor that observes the obstacles.
         success: text that says when a run counts as a success.
     """
 
@@ -75,7 +75,7 @@ class TaskExperiment:
 
     Attributes:
         task: a name in :data:`REPEATED_TASKS`.
-        method: how the obstacles are observed, a name in the task's ``observers``.
+        method: name of the observer, one of the task's ``observers``.
         seed: seed of the task.
     """
 
@@ -90,9 +90,9 @@ class TaskResult:
 
     Attributes:
         experiment: the run.
-        code: version of the code.
+        code: version of the code that ran, see :func:`~imitarm.benchmark.provenance.code_version`.
         outcome: ``"success"`` or ``"failed"``.
-        reason: explanation.
+        reason: explanation of the outcome.
         values: ``duration`` of the run [s]; ``clearance``, the smallest measured distance of the arm from an obstacle
             [m]; ``avoiding``, the fraction of the control steps in which the policy avoided an obstacle.
     """
@@ -105,7 +105,7 @@ class TaskResult:
 
     @property
     def success(self) -> bool:
-        """Whether the task was done and nothing was touched."""
+        """Whether the task was completed and no obstacle was touched."""
         return self.outcome == "success"
 
 
@@ -123,16 +123,16 @@ def run_repeatedly(
     out: Path,
     on_done: OnDone | None = None,
 ) -> list[TaskResult]:
-    """Run a task with ``count`` seeds.
+    """Run a task once with each of ``count`` successive seeds.
 
     Args:
         task: a name in :data:`REPEATED_TASKS`.
         count: number of runs.
         first: the first seed.
-        observer: how the obstacles are observed, a name in the task's ``observers``.
-        workers: processes that run the task.
-        out: folder in which results are saved, so that an interrupted benchmark continues.
-        on_done: function called with the progress.
+        observer: name of the observer, one of the task's ``observers``.
+        workers: processes that run the task; None: one for each processor.
+        out: folder for the results. If the folder already contains results, only the missing seeds run.
+        on_done: function that is called with the progress after each run.
 
     Raises:
         InputError: when a number is out of range, or the folder can't be used.
@@ -162,7 +162,7 @@ def _arm(task: str) -> ArmModel:
 
 
 def success_tables(results: Sequence[TaskResult]) -> list[Table]:
-    """Return the rate of success of one task with its interval, and a list of the failures."""
+    """Return a table of the rate of success of one task, and a table of the failures."""
     task = REPEATED_TASKS[results[0].experiment.task]
     n, done = len(results), sum(result.success for result in results)
     low, high = wilson_interval(done, n)

@@ -1,4 +1,4 @@
-"""Saved results of a benchmark: one line of JSON for each experiment, one file for each method."""
+"""Save the results of a benchmark: one file for each method, with one line of JSON for each experiment."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ SUFFIX = ".jsonl"
 
 @dataclass(frozen=True)
 class ResultFormat(Generic[Work, Outcome]):
-    """File format of the results of one benchmark: each result is one line of JSON.
+    """File format of the results of one benchmark. Each result is one line of JSON.
 
-    A result has the attributes ``experiment``, ``code``, ``outcome``, ``reason`` and ``values``, in this order; an
-    experiment is a dataclass with an attribute ``method``.
+    The class of the results has the attributes ``experiment``, ``code``, ``outcome``, ``reason`` and ``values``, in
+    this order. The class of the experiments is a dataclass with an attribute ``method``.
 
     Attributes:
         name: name and version of the format.
         experiment: class of the experiments.
         outcome: class of the results.
-        command: command that makes a folder of results; error messages name it.
+        command: command that makes a folder of results. Error messages name this command.
     """
 
     name: str
@@ -37,7 +37,7 @@ class ResultFormat(Generic[Work, Outcome]):
     command: str
 
     def store(self, folder: str | Path, *, reuse: bool = False) -> LineStore[Work, Outcome]:
-        """Return the store of results in a folder.
+        """Return a store that reads and writes results in a folder.
 
         Args:
             folder: the folder; created if missing.
@@ -49,7 +49,7 @@ class ResultFormat(Generic[Work, Outcome]):
         return LineStore(folder, self, reuse=reuse)
 
     def line(self, result: Any) -> str:
-        """Return a result as one line of JSON; null stands for nan."""
+        """Return a result as one line of JSON, in which null stands for nan."""
         content = {
             "format": self.name,
             "experiment": asdict(result.experiment),
@@ -61,7 +61,7 @@ class ResultFormat(Generic[Work, Outcome]):
         return json.dumps(content, allow_nan=False, separators=(",", ":"))
 
     def result(self, line: str) -> Outcome:
-        """Return the result in a line of JSON.
+        """Return the result that a line of JSON contains.
 
         Raises:
             ValueError: when the line is not JSON.
@@ -80,7 +80,7 @@ class ResultFormat(Generic[Work, Outcome]):
             raise FileFormatError(f"is not a result ({type(error).__name__}: {error})") from error
 
     def read(self, path: Path) -> list[Outcome]:
-        """Return the results in a file; lines that can't be read are left out."""
+        """Return the results in a file. Lines that can't be read are ignored."""
         if not path.exists():
             return []
         found = []
@@ -93,7 +93,7 @@ class ResultFormat(Generic[Work, Outcome]):
         return found
 
     def read_folders(self, folders: Iterable[str | Path]) -> list[Outcome]:
-        """Return the results of all folders; when an experiment has several results, the last one counts.
+        """Return the results of all folders. If an experiment has several results, the last result counts.
 
         Raises:
             InputError: when a folder does not exist or holds no results.
@@ -105,16 +105,16 @@ class ResultFormat(Generic[Work, Outcome]):
             here: list[Any] = [r for path in sorted(folder.glob(f"*{SUFFIX}")) for r in self.read(path)]
             found.update({saved.experiment: saved for saved in here})
             if not here:
-                raise InputError(f"{folder}: holds no results of '{self.command}'")
+                raise InputError(f"{folder}: contains no results of '{self.command}'; name the folder that --out named")
         return list(found.values())
 
 
 class LineStore(Store[Work, Outcome]):
-    """A folder with one file for each method, and one line in it for each experiment.
+    """A folder of results. Each method has a file, and each experiment has a line in the file of its method.
 
-    A line is written by one call to the operating system. A process that is killed can therefore leave at most one
-    incomplete line at the end of a file. Such a line is ignored when the file is read, and the next result begins a new
-    line. When an experiment has several lines, the last one counts.
+    The store writes a line by one call to the operating system. If the process is killed, at most the last line of a
+    file is incomplete. The store ignores an incomplete line, and writes the next result to a new line. If an experiment
+    has several lines, the last line counts.
 
     Args:
         folder: the folder; created if missing.
@@ -135,7 +135,10 @@ class LineStore(Store[Work, Outcome]):
             ) from error
 
     def known(self, experiments: Sequence[Work]) -> dict[Work, Outcome]:
-        """Return the saved results; without ``reuse``, results of other code are left out, as are unreadable lines."""
+        """Return the saved results that can be used.
+
+        Unreadable lines and, without ``reuse``, results of other code are left out.
+        """
         wanted = set(experiments)
         found: dict[Work, Outcome] = {}
         for method in dict.fromkeys(_method(e) for e in experiments):
@@ -146,7 +149,7 @@ class LineStore(Store[Work, Outcome]):
         return found
 
     def save(self, experiment: Work, outcome: Outcome) -> Outcome:
-        """Append one line, and return the result as it is read from the line.
+        """Append a result to its file as one line; return the result as it is read from this line.
 
         Raises:
             OSError: when the line can't be written.

@@ -1,8 +1,8 @@
-"""Run many experiments in parallel; each result is saved immediately, so an interrupted benchmark can be continued.
+"""Run many experiments in parallel. Each result is saved immediately, so an interrupted benchmark can be continued.
 
-Every benchmark runs its experiments with :func:`run_experiments`. A benchmark supplies the function that runs one
-experiment, and a store that saves results. Only the main process saves results. Therefore the processes that run the
-experiments may be on other machines, and need no common folder.
+Every benchmark runs its experiments with :func:`run_experiments`. The benchmark passes a function that runs one
+experiment, and a store that saves results. Only the main process saves results. Therefore the worker processes, which
+run the experiments, may be on other machines and need no common folder.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from imitarm.benchmark.provenance import code_version
 from imitarm.errors import InputError, TaskFailedError
 
 LOCAL, DASK = "loky", "dask"
-"""Names of two backends. The first uses processes of this machine (joblib), the second uses Dask workers."""
+"""Names of two backends. ``LOCAL`` uses processes of this machine (joblib). ``DASK`` uses the workers of a Dask
+scheduler."""
 _CONNECT = 10.0  # [s] until a scheduler must answer
 _SILENCE = 5.0  # [s] between two checks whether the scheduler is still there
 _AHEAD = 3  # experiments that each worker of a scheduler has waiting
@@ -38,19 +39,21 @@ Work = TypeVar("Work", bound=Hashable)
 Outcome = TypeVar("Outcome")
 
 OnDone = Callable[[int, int], None]
-"""Type of a function that is called with the number of finished experiments and the total number."""
+"""Type of a function that is called with the number of finished experiments and the number of all experiments."""
 
 
 class Store(ABC, Generic[Work, Outcome]):
-    """The place where a benchmark keeps its results."""
+    """Interface of a place in which a benchmark saves its results."""
 
     @abstractmethod
     def known(self, experiments: Sequence[Work]) -> dict[Work, Outcome]:
-        """Return the valid saved results of these experiments."""
+        """Return the saved results of those experiments that have a valid result."""
 
     @abstractmethod
     def save(self, experiment: Work, outcome: Outcome) -> Outcome:
-        """Save one result; even if the process is killed, :meth:`known` finds the whole result or no result.
+        """Save one result.
+
+        If the process is killed meanwhile, :meth:`known` finds either the whole result or no result.
 
         Returns:
             The result as :meth:`known` would return it.
@@ -65,12 +68,13 @@ class Workers:
     """The processes that run experiments.
 
     Attributes:
-        jobs: number of processes; None: one for each processor; 1: only this process. Not used with Dask.
+        jobs: number of processes; None: one for each processor; 1: only this process. With Dask, this number has no
+            effect.
         backend: :data:`LOCAL`, :data:`DASK`, or another backend of joblib.
         scheduler: address of the Dask scheduler, such as ``tcp://10.0.0.1:8786``; only for :data:`DASK`.
 
     Raises:
-        InputError: when a scheduler is given for another backend than Dask, or the Dask backend has no scheduler.
+        InputError: when the Dask backend has no scheduler, or another backend has a scheduler.
     """
 
     jobs: int | None = None
@@ -84,7 +88,7 @@ class Workers:
                 "scheduler', and workers with 'dask worker ADDRESS'"
             )
         if self.scheduler and self.backend != DASK:
-            raise InputError(f"--scheduler is for --backend dask, not for {self.backend!r}")
+            raise InputError(f"--scheduler works only with --backend dask, but the backend is {self.backend!r}")
 
 
 def run_experiments(
@@ -103,16 +107,16 @@ def run_experiments(
     Args:
         experiments: the experiments to run.
         run: function that runs one experiment; other processes must be able to import it.
-        store: where results are saved.
+        store: store that saves the results.
         workers: processes that run the experiments; None: one for each processor.
         fresh: whether to ignore saved results and run all experiments again.
         on_done: function called with the progress.
 
     Raises:
         InputError: when the backend does not exist.
-        TaskFailedError: when a process or the scheduler ended unexpectedly, or a result can't be saved; finished
-            results are kept.
-        KeyboardInterrupt: after Ctrl-C; finished results are kept.
+        TaskFailedError: when a process or the scheduler ended unexpectedly, or a result can't be saved. All earlier
+            results stay saved.
+        KeyboardInterrupt: after Ctrl-C. The results of finished experiments stay saved.
     """
     known = {} if fresh else store.known(experiments)
     missing = [e for e in dict.fromkeys(experiments) if e not in known]
@@ -137,7 +141,9 @@ def run_experiments(
 def in_parallel(
     function: Callable[[Work], Outcome], works: Sequence[Work], workers: Workers | None = None
 ) -> Generator[tuple[Work, Outcome], None, None]:
-    """Call a function for each experiment, in parallel; yield each experiment and its result as soon as it is done.
+    """Call a function for each experiment, in parallel.
+
+    Yield each experiment with its result as soon as it is finished.
 
     Raises:
         InputError: when the backend does not exist.
@@ -267,8 +273,8 @@ class _Job(Generic[Work, Outcome]):
             _end_with(self.parent)
         if code_version() != self.version:
             raise TaskFailedError(
-                f"a worker has another version of the code ({code_version()}) than the benchmark ({self.version}); use "
-                f"the same code everywhere, and do not change it while the benchmark runs; then {_RESUME}"
+                f"a worker runs another version of the code ({code_version()}) than the benchmark ({self.version}); "
+                f"use the same code everywhere, and do not change it while the benchmark runs; then {_RESUME}"
             )
         return work, self.function(work)
 
