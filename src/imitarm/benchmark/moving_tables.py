@@ -295,13 +295,13 @@ def _claim(
             else "both succeed in 0 scenes"
         )
         parts.append(
-            f"RMSE of {ours} minus {row}: {middle}, {ours} alone succeeds in {first} scenes, {row} alone in {second}"
+            f"RMSE of {ours} minus {row}: {middle}. Only {ours} succeeds in {first} scenes, only {row} in {second}."
         )
         held.append(p < 0.05 and sign * difference < 0.0)
     if not parts:
         return text, "not run", "–"
     verdict = "yes" if all(held) else "in part" if any(held) else "no"
-    return text, "; ".join(parts), verdict
+    return text, " ".join(parts), verdict
 
 
 def _success_claim(results: MovingResults, text: str, families: Sequence[str]) -> tuple[str, str, str]:

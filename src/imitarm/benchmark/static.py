@@ -1,6 +1,7 @@
-"""The avoidance benchmark in static scenes: one experiment is one method in one scene.
+"""The benchmark of avoidance in static scenes: an experiment tests one method in one scene.
 
-``StaticExperiment("S1", 3, 2000, "acfra").run()`` makes the scene, lets the method plan a path, and measures the path.
+``StaticExperiment("S1", 3, 2000, "acfra").run()`` makes a scene of family S1, plans a path with the method ``acfra``,
+and measures the path.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ VARIANTS: Mapping[str, tuple[str, Options]] = {
     "acfra-literal": ("acfra", (("method", "literal"),)),
     "acfra-mapf": ("acfra", (("method", "mapf"),)),
 }
-"""ACFRA with fixed options: ``literal`` uses the thesis's potential as printed (Eq 4.7), ``mapf`` corrects it."""
+"""Variants of ACFRA with fixed options. ``literal`` uses the potential as the thesis prints it (Eq 4.7), and ``mapf``
+uses a corrected potential."""
 _WHOLE_ARM = ("rrt-connect", "rrt-connect-tilt")  # these plan joints only, so they need an arm
 _TOOL_ON_ARM = np.array([0.65, 0.0, 0.30])  # [m] where the middle of a path is put in front of the Sawyer
 _POSTURES = 100  # along the path, for torques
@@ -47,7 +49,7 @@ _REACHED = 1e-3  # [m] a posture whose tool is farther away does not reach the p
 
 
 def method_names() -> tuple[str, ...]:
-    """Return the names of all methods: the controls, the policies that plan a whole path, and their variants."""
+    """Return the names of all methods: controls, policies that plan a whole path, and variants of these policies."""
     planners = [n for n in POLICIES if n not in _WHOLE_ARM and issubclass(POLICIES[n], PathPolicy)]
     return (*CONTROLS, *planners, *VARIANTS)
 
@@ -56,7 +58,7 @@ def policy_class(method: str) -> type[PathPolicy]:
     """Return the class of a method.
 
     Raises:
-        UnknownNameError: when there is no such method, or it plans no whole path.
+        UnknownNameError: when there is no such method, or the method does not plan a whole path.
     """
     name = VARIANTS[method][0] if method in VARIANTS else method
     if name in CONTROLS:
@@ -68,7 +70,7 @@ def policy_class(method: str) -> type[PathPolicy]:
 
 
 def build(method: str, case: StaticCase, options: Options = ()) -> PathPolicy:
-    """Return a method for a scene, with options that replace its defaults.
+    """Return the policy of a method for a scene. ``options`` replace the defaults of the method.
 
     Raises:
         InputError: when the method does not take an option.
@@ -85,19 +87,21 @@ def build(method: str, case: StaticCase, options: Options = ()) -> PathPolicy:
 
 @dataclass(frozen=True)
 class StaticExperiment:
-    """One method in one scene. All values are plain, so another process or machine can run the experiment.
+    """The definition of one run: one method in one scene.
+
+    Another process or machine can run it, because it contains only text and numbers.
 
     Attributes:
         family: one of :data:`~imitarm.benchmark.static_scenes.FAMILIES`.
-        dimension: 2 when the path may only be displaced horizontally, else 3.
-        seed: number of the scene.
+        dimension: 2 if the method may displace the path only horizontally; 3 if every direction is allowed.
+        seed: seed of the scene.
         method: one of :func:`method_names`.
         teachers: number of teachers from whom the skill was learned.
         options: options that replace the defaults of the method, such as those found by tuning.
-        torque: whether to compute the torques of a Sawyer, too. This takes most of the computing time.
-        memory: whether the method plans a second time, without a clock, to measure its peak memory. This plan takes
-            several times as long.
-        skill: file of the skill on whose path the obstacles stand; empty: the family's own skill.
+        torque: whether to compute the joint torques of a Sawyer too. This computation takes most of the time of a run.
+        memory: whether to measure the peak memory. For this purpose, the method plans a second time, which takes
+            several times as long and is not timed.
+        skill: file of the skill on whose path the obstacles stand; if empty, the skill of the family is used.
 
     Raises:
         UnknownNameError: when family or method is not known.
@@ -142,9 +146,9 @@ class StaticExperiment:
         return static_case(self.family, self.dimension, self.seed, teachers=self.teachers, skill=skill)
 
     def run(self) -> StaticResult:
-        """Let the method plan in its scene, and measure the planned path.
+        """Plan a path with the method in its scene, and measure the path.
 
-        Each plan is slowed down wherever the tool would exceed its limit of speed or acceleration.
+        Where the tool would exceed its limit of speed or acceleration, the motion is slowed down first.
 
         Returns:
             The result. If the method raises an error, the outcome is "failed", and the reason contains the error.
@@ -215,10 +219,12 @@ class StaticResult:
         code: version of the code that ran, see :func:`~imitarm.benchmark.provenance.code_version`.
         outcome: one of :data:`~imitarm.benchmark.static_measures.OUTCOMES`.
         reason: explanation of the outcome; empty after a success.
-        values: measures by name: those of :class:`~imitarm.benchmark.static_measures.PathMeasures`; ``n_obstacles``;
-            ``must_refuse`` of the scene; ``build_seconds``, ``plan_seconds`` and ``plan_cpu`` (processor time) [s];
-            ``unmoved`` (fraction of the skill's components that the method did not move); ``answer`` of the oracle;
-            ``torque_rms`` [N m], ``torque_peak`` (divided by the rated torque); ``peak_memory`` [bytes].
+        values: measures by name. They include the attributes of
+            :class:`~imitarm.benchmark.static_measures.PathMeasures`, ``n_obstacles``, and ``must_refuse`` of the scene.
+            ``build_seconds`` is the time of the construction, ``plan_seconds`` the time of planning, and ``plan_cpu``
+            the processor time of planning [s]. ``unmoved`` is the fraction of the skill's components that the method
+            did not move. ``answer`` is the answer of the oracle. ``torque_rms`` [N m] and ``torque_peak`` (relative to
+            the rated torque) are joint torques. ``peak_memory`` is in bytes.
     """
 
     experiment: StaticExperiment
@@ -239,7 +245,7 @@ class StaticResult:
 
 @lru_cache(maxsize=32)
 def saved_skill(path: str) -> Skill:
-    """Return the skill in a file, which is read once in each process."""
+    """Return the skill in a file. Each process reads the file only once."""
     return Skill.load(path)
 
 
@@ -262,14 +268,15 @@ def run_experiment(experiment: StaticExperiment) -> StaticResult:
 
 
 def torques_on_sawyer(trajectory: Trajectory) -> dict[str, float]:
-    """Return the joint torques of a Sawyer whose tool follows a path, by inverse kinematics and inverse dynamics.
+    """Compute the joint torques of a Sawyer whose tool follows a path, by inverse kinematics and inverse dynamics.
 
     The path is rotated by 90 degrees about the vertical axis, so that its x axis runs sideways in front of the arm. The
     middle of the path is 0.65 m in front of the base. The tool points down.
 
     Returns:
-        ``torque_rms``: root mean square over time of the norm of the joint torques [N m]; ``torque_peak``: largest
-        torque divided by the rated torque of its joint. Both are nan if the arm can't reach the path.
+        Two values, which are nan if the arm can't reach the path. ``torque_rms`` is the root mean square over time of
+        the norm of the joint torques [N m]. ``torque_peak`` is the largest ratio of a joint's torque to its rated
+        torque.
     """
     arm = _sawyer()
     even = trajectory.resample(_POSTURES)

@@ -1,4 +1,4 @@
-"""What the static benchmark says about the claims of thesis Chapter 4, and whether the benchmark itself is sound."""
+"""Check the claims of thesis Chapter 4 against the results of the static benchmark, and check the benchmark itself."""
 
 from __future__ import annotations
 
@@ -43,14 +43,15 @@ _LEVEL = 0.05  # of significance
 _FEWEST = 6  # common successes; with fewer, the signed-rank test can't be significant
 
 Found = tuple[str, str]
-"""Two texts: the measured values, and whether the claim holds."""
+"""Two texts: the measured values, and whether the claim holds ("yes", "no", "in part" or "–")."""
 _NOT_RUN: Found = ("not run", "–")
 
 
 def cost_law(results: StaticResults, row: str = OURS) -> tuple[float, float, int]:
-    """Return the exponent b of the processor time, its standard error, and the number of plans.
+    """Return how the processor time depends on the number of obstacles: exponent, standard error, and number of plans.
 
-    The power law ``time = a n^b`` is fitted to the logarithms by least squares; n is the number of obstacles.
+    The power law ``time = a n^b`` is fitted to the logarithms by least squares. Here n is the number of obstacles, and
+    b is the exponent.
     """
     found = [r for r in results.of(row, results.usual) if r.value("plan_cpu") > 0.0 and r.value("n_obstacles") >= 1.0]
     x = np.log([r.value("n_obstacles") for r in found])
@@ -64,13 +65,13 @@ def cost_law(results: StaticResults, row: str = OURS) -> tuple[float, float, int
 
 
 def claims_table(results: StaticResults) -> Table:
-    """Return a table of the thesis's claims and of the benchmark's own checks: the result, and whether it held."""
+    """Return a table of claims of the thesis and of checks of the benchmark itself, each with its result."""
     rows = [(claim, *evaluate(results)) for claim, evaluate in _CLAIMS]
     note = (
-        "A claim holds if every method that was run for it supports it. A difference in the paired comparison counts "
-        f"if its p-value after Holm's correction is below {_LEVEL:g}. The RMSE of a method counts only if the method "
-        f"and {OURS} both succeed in at least {_FEWEST} scenes. If a method was run with tuned options, these results "
-        "count, otherwise those with default options."
+        f"A claim holds if the results of all compared methods support it. An RMSE difference is the RMSE of {OURS} "
+        "minus that of the other method, over the scenes in which both succeed. It counts if there are at least "
+        f"{_FEWEST} such scenes, and if its p-value after Holm's correction is below {_LEVEL:g}. The results with "
+        "tuned options count; without tuned options, those with default options count."
     )
     return Table("Claims of the thesis, and checks", ("claim or check", "found", "held?"), tuple(rows), note)
 
@@ -88,22 +89,25 @@ def _theirs(results: StaticResults, columns: Sequence[str] = tuple(PRINTED)) -> 
 def _compared(
     results: StaticResults, columns: Sequence[str], wanted: Callable[[Scene], bool], *, better: bool
 ) -> Found:
-    """Compare the RMSE of :data:`OURS` with methods of the thesis; ``better``: whether ours should be the smaller."""
+    """Compare the RMSE of :data:`OURS` with methods of the thesis.
+
+    ``better`` is True if the thesis claims a smaller RMSE of :data:`OURS`.
+    """
     rows = _theirs(results, columns)
     found = [p for p in pairings(results, lambda s: results.usual(s) and wanted(s)) if p.row in rows]
     if not found:
         return _NOT_RUN
     parts, held = [], []
     for p in found:
-        succeeds = f"{OURS} alone succeeds in {p.only_ours} scenes, the other method alone in {p.only_other}"
+        alone = f"only {OURS} succeeds in {p.only_ours}, only the other in {p.only_other}."
         if not p.both:
-            parts.append(f"{p.row}: both succeed in 0 scenes, {succeeds}")
+            parts.append(f"{p.row}: both succeed in 0 scenes, {alone}")
             continue
-        text = f"RMSE difference {1e3 * p.difference:+.1f} mm in {p.both} scenes in which both succeed"
-        parts.append(f"{p.row}: {text} (p {p_value(p.p_rmse)}), {succeeds}")
+        text = f"both succeed in {p.both} scenes, {alone}"
+        parts.append(f"{p.row}: {text} RMSE difference {1e3 * p.difference:+.1f} mm (p {p_value(p.p_rmse)}).")
         if p.both >= _FEWEST:
             held.append((p.difference < 0.0) == better and p.p_rmse < _LEVEL)
-    return "; ".join(parts), _verdict(held)
+    return " ".join(parts), _verdict(held)
 
 
 def _verdict(held: Sequence[bool]) -> str:
@@ -139,7 +143,8 @@ def _scaling(results: StaticResults) -> Found:
         if all(of):
             rates[row] = good[0] / of[0] - good[1] / of[1]
             parts.append(
-                f"{row}: {rate(good[0], of[0])} with at most 2 obstacles, {rate(good[1], of[1])} with at least 4"
+                f"{row}: success {rate(good[0], of[0])} % with at most 2 obstacles, {rate(good[1], of[1])} % with "
+                "at least 4"
             )
     ours = rates.pop(_best_row(results, OURS), math.nan)
     return ("; ".join(parts) or "not run"), _verdict([loss > ours for loss in rates.values()])
@@ -177,7 +182,7 @@ def _completion(results: StaticResults) -> Found:
         if values:
             parts.append(f"{row}: {np.mean(values):.3f}")
             held.append(float(np.mean(ours)) < float(np.mean(values)) - 1e-3)
-    return f"mean duration of the successful motions, divided by the learned duration: {'; '.join(parts)}", _verdict(
+    return f"mean duration of the successful motions divided by the learned duration: {'; '.join(parts)}", _verdict(
         held
     )
 
@@ -189,7 +194,7 @@ def _local(results: StaticResults) -> Found:
         return _NOT_RUN
     unmoved = 100 * float(np.mean([r.value("unmoved") for r in ours]))
     parts = [
-        f"{OURS}: RMSE of unaffected samples {1e3 * np.mean(known):.1f} mm, {unmoved:.0f} % of the components unmoved"
+        f"{OURS}: RMSE of unaffected samples {1e3 * np.mean(known):.1f} mm, {unmoved:.0f} % of the components in place."
     ]
     held = []
     for row in _theirs(results):
@@ -205,11 +210,11 @@ def _local(results: StaticResults) -> Found:
         both = np.array([p for p in pairs if np.isfinite(p).all()])
         if len(both):
             parts.append(
-                f"{row}: {1e3 * both[:, 1].mean():.1f} mm, {OURS} {1e3 * both[:, 0].mean():.1f} mm in the same "
-                f"{len(both)} scenes"
+                f"{row}: {1e3 * both[:, 1].mean():.1f} mm, against {1e3 * both[:, 0].mean():.1f} mm of {OURS} in the "
+                f"same {len(both)} scenes."
             )
             held.append(bool(both[:, 0].mean() < both[:, 1].mean()))
-    return "; ".join(parts), _verdict(held)
+    return " ".join(parts), _verdict(held)
 
 
 def _teachers(results: StaticResults) -> Found:
@@ -260,26 +265,29 @@ def _cost(results: StaticResults) -> Found:
 _CLAIMS: tuple[tuple[str, Callable[[StaticResults], Found]], ...] = (
     ("ACFRA has the smallest RMSE in most sweeping tasks (Table 4.1)", _tasks),
     ("DMP+AT and DMP+ANN have a smaller RMSE than ACFRA with two obstacles (Section 4.2)", _two_obstacles),
-    ("ACFRA has a smaller RMSE than all others with more than two obstacles (Section 4.2)", _more_obstacles),
+    ("ACFRA has a smaller RMSE than all other methods with more than two obstacles (Section 4.2)", _more_obstacles),
     ("DMP+AT does not scale to many obstacles", _scaling),
-    ("ACFRA computes faster than the others (Fig 4.9)", _cheaper("plan_seconds", "ms", 1e3)),
-    ("ACFRA completes the task faster than the others (Fig 4.9)", _completion),
-    ("ACFRA needs less memory than the others (Section 4.3)", _cheaper("peak_memory", "kB", 1e-3)),
+    ("ACFRA computes faster than the other methods (Fig 4.9)", _cheaper("plan_seconds", "ms", 1e3)),
+    ("ACFRA completes the task faster than the other methods (Fig 4.9)", _completion),
+    ("ACFRA needs less memory than the other methods (Section 4.3)", _cheaper("peak_memory", "kB", 1e-3)),
     ("ACFRA changes the path only where obstacles affect it (Section 4.2)", _local),
     ("one setting is enough for obstacles of all shapes", _all_shapes),
-    ("ACFRA succeeds more often with a skill of several teachers than with that of one (Section 4.2)", _teachers),
-    ("cost of ACFRA over the number of obstacles", _cost),
+    (
+        "ACFRA succeeds more often with a skill of several teachers than with a skill of one teacher (Section 4.2)",
+        _teachers,
+    ),
+    ("how the computing time of ACFRA depends on the number of obstacles", _cost),
     ("check: a tool that aims at the obstacle never succeeds", _control("aims-at-obstacle", 0.0)),
     ("check: without avoidance, at most 2 % of the runs succeed", _control("no-avoidance", _TOY)),
     (
-        "check: no path to the exact goal keeps the clearance where the oracle proves that no path can",
+        "check: no result contradicts a proof of the oracle that no path exists",
         _beyond_oracle,
     ),
 )
 
 
 def static_tables(results: StaticResults) -> list[Table]:
-    """Return every table that has results; the table on the claims comes first."""
+    """Return all tables that have rows. The table of the claims comes first."""
     families = results.families()
     found = [claims_table(results)]
     if any(family == TASKS_FAMILY for family, _ in families):

@@ -1,4 +1,4 @@
-"""Compare the methods of the static benchmark in pairs, by skill, and with the thesis: Table 4.1 and Fig 4.9."""
+"""Compare the methods of the static benchmark with one another, and with Table 4.1 and Fig 4.9 of the thesis."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ PRINTED = {
     "GMM+IRL": (0.0123, 0.0242, 0.0226, 0.0180, 0.0318, 0.0312, 0.0265, 0.0170),
     "ACFRA": (0.0128, 0.0215, 0.0210, 0.0100, 0.0330, 0.0286, 0.0262, 0.0200),
 }
-"""RMSE of the tasks T1 to T8 in thesis Table 4.1; the thesis states no unit."""
+"""RMSE of the tasks T1 to T8, as printed in thesis Table 4.1. The thesis states no unit."""
 READINGS = {
     "DMP+AT": ("dmp-steering", "dmp-potential"),
     "DMP+ANN": ("dmp-ann",),
@@ -46,7 +46,7 @@ READINGS = {
     "GMM+IRL": ("gmm-irl",),
     "ACFRA": ("acfra", "acfra-mapf", "acfra-literal"),
 }
-"""For each column of Table 4.1 of the thesis, the methods of this library that stand for it."""
+"""For each method in Table 4.1 of the thesis, our interpretations of this method."""
 
 
 @dataclass(frozen=True)
@@ -54,17 +54,17 @@ class Pairing:
     """Comparison of :data:`OURS` with another method in the same scenes.
 
     Attributes:
-        row: the other method.
+        row: name of the other method's row.
         scenes: number of scenes in which both were run.
-        only_ours: number of scenes in which :data:`OURS` succeeds and the other method does not.
-        only_other: number of scenes in which the other method succeeds and :data:`OURS` does not.
-        p_success: p-value of McNemar's exact test.
+        only_ours: number of scenes in which only :data:`OURS` succeeds.
+        only_other: number of scenes in which only the other method succeeds.
+        p_success: p-value of McNemar's exact test of the successes.
         both: number of scenes in which both methods succeed.
-        difference: mean of the RMSE of :data:`OURS` minus the RMSE of the other method, over the scenes in which both
+        difference: mean difference of the RMSE, :data:`OURS` minus the other method, over the scenes in which both
             succeed [m]; nan if there is no such scene.
         low: lower end of the 95 % interval of ``difference`` [m].
-        high: upper end of this interval [m].
-        p_rmse: p-value of Wilcoxon's signed-rank test.
+        high: upper end of the 95 % interval of ``difference`` [m].
+        p_rmse: p-value of Wilcoxon's signed-rank test of the RMSE.
     """
 
     row: str
@@ -80,7 +80,7 @@ class Pairing:
 
 
 def mcnemar(only_first: int, only_second: int) -> float:
-    """Return the p-value of McNemar's exact test: a two-sided sign test of the scenes in which two methods differ."""
+    """Return the p-value of McNemar's exact test of two methods."""
     n, k = only_first + only_second, min(only_first, only_second)
     if n == 0:
         return 1.0
@@ -89,7 +89,7 @@ def mcnemar(only_first: int, only_second: int) -> float:
 
 
 def signed_rank(differences: Array) -> float:
-    """Return the p-value of Wilcoxon's signed-rank test that differences are symmetric about 0; 1 if all are 0."""
+    """Return the p-value of Wilcoxon's signed-rank test of paired differences; 1 if all differences are 0."""
     from scipy.stats import wilcoxon  # noqa: PLC0415 (takes long to import)
 
     nonzero = differences[differences != 0.0]
@@ -97,7 +97,7 @@ def signed_rank(differences: Array) -> float:
 
 
 def pairing(results: StaticResults, row: str, wanted: Callable[[Scene], bool]) -> Pairing:
-    """Compare :data:`OURS` with the method of another row, in the scenes that have a solution."""
+    """Compare :data:`OURS` with another method in those of the wanted scenes that have a solution."""
     pairs = [
         (rows[OURS], rows[row])
         for scene, rows in results.by_scene.items()
@@ -135,7 +135,7 @@ def _normal(differences: Array) -> tuple[float, float]:
 
 
 def pairings(results: StaticResults, wanted: Callable[[Scene], bool]) -> list[Pairing]:
-    """Compare :data:`OURS` with every other method, with p-values after Holm's correction."""
+    """Compare :data:`OURS` with every other method. The p-values are corrected by Holm's method."""
     others = [row for row in results.rows if row != OURS and row not in CONTROLS]
     found = [p for row in others if (p := pairing(results, row, wanted)).scenes]
     success, rmse = holm([p.p_success for p in found]), holm([p.p_rmse for p in found])
@@ -143,7 +143,7 @@ def pairings(results: StaticResults, wanted: Callable[[Scene], bool]) -> list[Pa
 
 
 def paired_table(results: StaticResults) -> Table:
-    """Return a table that compares :data:`OURS` with each other method, in all families together and in each family."""
+    """Return a table that compares :data:`OURS` with each other method, over all families and in each family."""
     rows = []
     for family in [None, *results.families()]:
         for p in pairings(results, lambda s, f=family: results.usual(s) and f in (None, s[:2])):  # type: ignore[misc]
@@ -157,12 +157,13 @@ def paired_table(results: StaticResults) -> Table:
         "only the other>",
         "p, Holm>",
         "both succeed>",
-        f"RMSE, {OURS} minus other [mm] (95 %)>",
+        f"RMSE of {OURS} minus RMSE of the other [mm] (95 %)>",
         "p, Holm>",
     )
     note = (
-        "Success: McNemar's exact test. RMSE: Wilcoxon's signed-rank test over the scenes in which both succeed. "
-        "p-values are corrected by Holm's method for the number of methods."
+        "The first p-value is that of McNemar's exact test of the successes. The second p-value is that of Wilcoxon's "
+        "signed-rank test of the RMSE, in the scenes in which both succeed. Holm's method corrects both for the "
+        "number of methods."
     )
     return Table(f"Paired comparison with {OURS}", columns, tuple(rows), note)
 
@@ -175,12 +176,12 @@ def _difference(p: Pairing) -> str:
 
 
 def p_value(value: float) -> str:
-    """Return a p-value as text."""
+    """Return a p-value as text with three decimals."""
     return f"{value:.3f}" if value >= 0.001 else "< 0.001"
 
 
 def task_of(scene: Scene) -> str:
-    """Return the name of the sweeping task of a scene, such as "T1"; empty in other families."""
+    """Return the name of the sweeping task of a scene, such as "T1"; empty if the scene is not a sweeping task."""
     return f"T{scene[2] % N_TASKS + 1}" if scene[0] == TASKS_FAMILY else ""
 
 
@@ -189,7 +190,7 @@ def _in_tasks(results: StaticResults, row: str, task: str) -> list[StaticResult]
 
 
 def printed_table(results: StaticResults) -> Table:
-    """Return Table 4.1 of the thesis: RMSE of the sweeping tasks T1 to T8, printed and ours."""
+    """Return a table of the RMSE in the sweeping tasks T1 to T8: the values of thesis Table 4.1 and ours."""
     tasks = [f"T{i + 1}" for i in range(N_TASKS)]
     rows = []
     for name, values in PRINTED.items():
@@ -206,19 +207,22 @@ def printed_table(results: StaticResults) -> Table:
             if any(not cell.endswith("of 0)") for cell in cells):
                 rows.append((row, *cells, mean(means, 1.0, 4)))
     note = (
-        "Printed values: thesis Table 4.1, which states no unit, no number of failures and no spread; the printed "
-        "average of DMP+ANN is 0.224, ten times the mean of its column. Ours: mean RMSE of the successes [m], and in "
-        "brackets the number of scenes in which the method succeeded. In each scene, the obstacles of the task are "
-        "moved a little. The mean of a method that fails in some scenes is over fewer "
-        "scenes than the means of the other methods."
+        "Printed: values of thesis Table 4.1, which states no unit, no number of failures and no spread. The thesis "
+        "prints 0.224 as the average of DMP+ANN, which is ten times the mean of the printed values. All other rows: "
+        "mean RMSE of the successes [m], and in brackets the number of scenes in which the method succeeded. In each "
+        "scene, the obstacles of the task are moved a little. If a method fails in some scenes, its mean includes "
+        "fewer scenes."
     )
     return Table(
-        "Table 4.1 of the thesis, and ours: RMSE", ("method", *(f"{t}>" for t in tasks), "average>"), tuple(rows), note
+        "RMSE in the sweeping tasks: Table 4.1 of the thesis, and our values",
+        ("method", *(f"{t}>" for t in tasks), "average>"),
+        tuple(rows),
+        note,
     )
 
 
 def times_by_task(results: StaticResults, name: str, factor: float = 1.0) -> dict[str, list[float]]:
-    """Return the median of a measure over the successes of each task, for each row (thesis Fig 4.9)."""
+    """Return, for each row, the median of a measure over the successes in each task (for thesis Fig 4.9)."""
     found = {}
     for row in results.rows:
         if row in CONTROLS:
@@ -233,23 +237,23 @@ def times_by_task(results: StaticResults, name: str, factor: float = 1.0) -> dic
 
 
 def times_table(results: StaticResults) -> Table:
-    """Return the data of Fig 4.9: time to compute and time to complete the tasks T1 to T8."""
+    """Return a table for thesis Fig 4.9: the times to compute and to complete the tasks T1 to T8."""
     rows = []
     for what, name, factor in (("to compute [ms]", "plan_seconds", 1e3), ("to complete [s]", "duration", 1.0)):
         for row, found in times_by_task(results, name, factor).items():
             rows.append((what, row, *(f"{v:.2f}" if math.isfinite(v) else "–" for v in found)))
     columns = ("time", "method", *(f"T{i + 1}>" for i in range(N_TASKS)))
-    note = "Medians over the successes. Fig 4.9 of the thesis does not say which of the two times it shows."
+    note = "Medians over the successful plans. Fig 4.9 of the thesis does not say which of the two times it shows."
     return Table("Fig 4.9 of the thesis: time to compute and time to complete", columns, tuple(rows), note)
 
 
 def numbers_of_teachers(results: StaticResults) -> list[int]:
-    """Return the numbers of teachers of the skills that were learned from synthetic teachers, in ascending order."""
+    """Return the numbers of synthetic teachers that occur in the results, in ascending order."""
     return sorted({scene[3] for scene in results.by_scene if not scene[4]})
 
 
 def teachers_table(results: StaticResults) -> Table:
-    """Return a table of success and deviation by the number of teachers, for methods that were run with all numbers."""
+    """Return a table of success and RMSE by the number of teachers, for methods that were run with all numbers."""
     numbers = numbers_of_teachers(results)
     common = common_seeds(results)
     rows = []
@@ -264,18 +268,18 @@ def teachers_table(results: StaticResults) -> Table:
             rows.append((row, *cells))
     names = ["1 teacher" if n == 1 else f"{n} teachers" for n in numbers]
     columns = [c for name in names for c in (f"{name}: success % (95 %)>", f"{name}: RMSE [mm]>")]
-    note = f"{len(common)} seeds, for which the scenes of every number of teachers have a solution."
+    note = f"Results of the {len(common)} scenes that have a solution with every number of teachers."
     return Table("Number of teachers", ("method", *columns), tuple(rows), note)
 
 
 def common_seeds(results: StaticResults) -> set[tuple[str, int, int]]:
-    """Return family, dimension and seed of the scenes that have a solution with every number of teachers."""
+    """Return the scenes that have a solution with every number of teachers, as family, dimension and seed."""
     own = [s for s in results.by_scene if not s[4] and results.solvable(s)]
     return set.intersection(*({s[:3] for s in own if s[3] == n} for n in numbers_of_teachers(results)))
 
 
 def skills_table(results: StaticResults) -> Table:
-    """Return a table of success, refusals and deviation for each skill that comes from a file."""
+    """Return a table of success, refusals and deviation for each skill from a file."""
     skills = sorted({scene[4] for scene in results.by_scene if scene[4]})
     rows = []
     for skill in skills:
@@ -310,11 +314,12 @@ def skills_table(results: StaticResults) -> Table:
         "keeps the clearance % (95 %)>",
         "contact>",
         "refused>",
-        "refused of the impossible scenes>",
-        "RMSE of the successes [mm]>",
+        "refused impossible scenes>",
+        "mean RMSE of the successes [mm]>",
         "largest deviation [sigma]>",
     )
     note = (
-        "Scenes on the paths of skills from files. The other tables leave out these scenes, unless there are no others."
+        "Scenes whose obstacles stand on the paths of skills from files. The other tables count these scenes only if "
+        "there are no other scenes."
     )
     return Table("Skills from files", columns, tuple(rows), note)

@@ -1,6 +1,7 @@
-"""Measures of a planned path of the tool in a static scene, computed independently of the compared methods.
+"""Measure a planned path of the tool in a static scene, with code that the compared methods do not use.
 
-The true distances are computed at 4000 points of the polyline that would be executed, not at the samples of the plan.
+The distances to the obstacles are computed at 4000 points of the path, which are closer together than the samples of
+the plan.
 """
 
 from __future__ import annotations
@@ -23,20 +24,21 @@ from imitarm.trajectory import Trajectory
 Array = NDArray[np.float64]
 
 DENSE = 4000
-"""Number of points, evenly spaced in time, at which distances are measured."""
+"""Number of points of the path, evenly spaced in time, at which distances to the obstacles are computed."""
 NEAR = 0.10
-"""A sample of the learned path is unaffected if the tool there is farther than this from every obstacle [m]."""
+"""A sample of the learned path is unaffected if a tool at this sample is farther than this distance from every obstacle
+[m]."""
 AT_GOAL = 0.005
 """Largest permitted distance from start, goal and contact points, and largest displacement in a forbidden direction
 [m]."""
 LATEST = 2.0
-"""Longest permitted duration, divided by the learned duration."""
+"""Longest permitted duration of a successful motion, divided by the learned duration."""
 MAX_SPEED, MAX_ACCELERATION = 1.7, 13.0
-"""Largest speed [m/s] and acceleration [m/s^2] of the tool: the Cartesian limits that the manufacturer states for the
-Panda. A plan that exceeds a limit is first slowed down at these times (:meth:`~imitarm.policies.PathPlan.within`). If
-that does not suffice, the whole plan is slowed down by one factor. Slowing down does not change the path."""
+"""Limits of the tool's speed [m/s] and acceleration [m/s^2], which the manufacturer of the Panda states. A plan is
+slowed down at the times at which it exceeds a limit (:meth:`~imitarm.policies.PathPlan.within`). If the plan still
+exceeds a limit, the whole plan is slowed down by one factor. The path does not change."""
 SLACK = 0.0005
-"""Tolerance of the required clearance [m]: a path keeps it if its clearance is at most this much smaller."""
+"""Tolerance of the clearance [m]. A path keeps the required clearance if its clearance is at most this much smaller."""
 _SAMPLES = 200  # of the learned path, and of a planned path for speed, acceleration and smoothness
 
 
@@ -45,31 +47,31 @@ class PathMeasures:
     """Measures of one path.
 
     Attributes:
-        clearance: smallest distance of the tool from an obstacle, at :data:`DENSE` points [m].
-        separation: lower bound of ``clearance`` from supporting planes, computed without a distance function [m].
+        clearance: smallest distance between tool and obstacles, at :data:`DENSE` points of the path [m].
+        separation: lower bound of ``clearance``, computed from separating planes instead of a distance function [m].
         start_error: distance of the first position from the learned start [m].
         goal_error: distance of the last position from the goal [m].
-        contact_error: largest distance of the path from a pinned point of the learned path [m]; 0 if no point is
-            pinned.
-        forbidden: largest displacement in a forbidden direction, over all samples [m]. It is measured from the nearest
-            point of the learned path, and from the point at the same fraction of the duration; the smaller value
-            counts.
-        max_speed: largest speed as planned [m/s].
-        max_acceleration: largest acceleration as planned [m/s^2].
-        slowdown: factor, at least 1, by which the execution is slower than the plan. It keeps speed and acceleration
-            within their limits.
-        duration: duration of the execution, which is ``slowdown`` times the duration of the plan [s].
+        contact_error: largest distance between the path and a pinned point, which the path must meet [m]; 0 if no point
+            is pinned.
+        forbidden: largest displacement of the path in a forbidden direction [m]. The displacement of a sample is
+            measured from two points of the learned path: the nearest point, and the point at the same fraction of the
+            duration. The smaller value counts.
+        max_speed: largest speed of the planned motion [m/s].
+        max_acceleration: largest acceleration of the planned motion [m/s^2].
+        slowdown: factor by which the whole plan is slowed down to keep its limits; at least 1.
+        duration: duration of the motion [s]: ``slowdown`` times the duration of the plan.
         duration_ratio: ``duration`` divided by the learned duration.
-        rmse: root mean square distance from the learned path at equal fractions of the durations [m] (thesis Eq 4.9,
-            with the square root).
+        rmse: root mean square distance between planned and learned path at equal fractions of their durations [m]
+            (thesis Eq 4.9, with the square root).
         rmse_unaffected: like ``rmse``, but only over the samples of the learned path at which the tool is farther than
             :data:`NEAR` from every obstacle [m]; nan if there is no such sample.
         path_rmse: root mean square distance from each sample of the learned path to the nearest point of the planned
-            path, whatever the timing [m].
-        deviation: largest displacement, measured in standard deviations of the demonstrations (Mahalanobis distance).
+            path [m]. It does not depend on the timing.
+        deviation: largest displacement from the learned path, in standard deviations of the demonstrations (Mahalanobis
+            distance).
         length_ratio: path length divided by the length of the learned path.
-        sparc: spectral arc length of the speed; the closer to 0, the smoother.
-        ldlj: logarithmic dimensionless jerk; the closer to 0, the smoother.
+        sparc: spectral arc length of the speed; a value closer to 0 means a smoother motion.
+        ldlj: logarithmic dimensionless jerk; a value closer to 0 means a smoother motion.
     """
 
     clearance: float
@@ -141,9 +143,9 @@ def _dense(trajectory: Trajectory) -> Trajectory:
 
 
 def evenly(trajectory: Trajectory) -> Trajectory:
-    """Fit a cubic spline through the samples of a trajectory, and return it at 200 evenly spaced times.
+    """Fit a cubic spline through the samples of a trajectory, and return the spline at 200 evenly spaced times.
 
-    All methods get the same number of samples, so that finite differences treat them alike.
+    The paths of all methods then have the same number of samples, so that their finite differences can be compared.
     """
     times = np.linspace(trajectory.times[0], trajectory.times[-1], _SAMPLES)
     return Trajectory(times, CubicSpline(trajectory.times, trajectory.positions)(times))
@@ -166,7 +168,7 @@ def _sphere_distances(case: StaticCase, trajectory: Trajectory) -> Array:
 
 
 def unaffected(case: StaticCase, nominal: Trajectory) -> NDArray[np.bool_]:
-    """Return for each sample of the learned path whether the tool is farther than :data:`NEAR` from all obstacles."""
+    """Return which samples of the learned path are unaffected, see :data:`NEAR`."""
     return np.asarray(_sphere_distances(case, nominal).min(axis=0) > NEAR)
 
 
@@ -216,30 +218,34 @@ def _rms(values: Array) -> float:
 def outcome(case: StaticCase, found: PathMeasures) -> tuple[str, str]:
     """Return the outcome of a planned path, one of :data:`OUTCOMES`, and an explanation."""
     if not found.clearance > 0.0:
-        return "contact", f"the tool is {1e3 * found.clearance:.1f} mm from an obstacle"
+        return "contact", f"the smallest distance between tool and obstacles is {1e3 * found.clearance:.1f} mm"
     for error, limit, where in (
         (found.start_error, AT_GOAL, "from the start"),
         (found.goal_error, AT_GOAL, "from the goal"),
         (found.contact_error, AT_GOAL, "from a contact point"),
-        (found.forbidden, AT_GOAL, "away in a forbidden direction"),
+        (found.forbidden, AT_GOAL, "away from the learned path in a forbidden direction"),
     ):
         if error > limit:
             return "missed goal", f"the path is {1e3 * error:.1f} mm {where}"
     if found.duration_ratio > LATEST:
         planned = found.duration_ratio / found.slowdown
         if planned <= LATEST:
-            fast = f"the plan has {found.max_speed:.2f} m/s and {found.max_acceleration:.1f} m/s^2"
-            return "limit", f"{fast}; within the limits, it takes {found.duration_ratio:.2f} times the learned duration"
-        return "late", f"the motion takes {planned:.2f} times the learned duration"
+            fast = f"the plan reaches {found.max_speed:.2f} m/s and {found.max_acceleration:.1f} m/s^2"
+            return (
+                "limit",
+                f"{fast}; within the limits, the motion takes {found.duration_ratio:.2f} times the learned duration",
+            )
+        return "late", f"the planned motion takes {planned:.2f} times the learned duration"
     if found.clearance < case.clearance - SLACK:
-        return "too near", f"{1e3 * found.clearance:.1f} mm instead of {1e3 * case.clearance:.0f} mm"
+        return "too near", f"the clearance is {1e3 * found.clearance:.1f} mm instead of {1e3 * case.clearance:.0f} mm"
     return "success", ""
 
 
 OUTCOMES = ("success", "too near", "contact", "missed goal", "late", "limit", "refused", "failed")
-"""Possible outcomes: "success"; "too near" (a success, but nearer to an obstacle than required); "contact"; "missed
-goal" (the path misses the goal, the start or a contact point, or moves in a forbidden direction); "late"; "limit" (late
-because of the limits of speed and acceleration); "refused" (before any motion); "failed" (the method raised an
-error)."""
+"""Possible outcomes. "success": the path meets all conditions. "too near": the same, but the path comes nearer to an
+obstacle than required. "contact": the tool touches an obstacle. "missed goal": the path misses the goal, the start or a
+contact point, or is displaced in a forbidden direction. "late": the plan takes too long. "limit": the plan takes too
+long when it is slowed down to keep the limits of speed and acceleration. "refused": the method refused the scene.
+"failed": the method raised an error."""
 SUCCESSES = OUTCOMES[:2]
-"""Outcomes that count as success: no contact, and goal reached in time within the limits of speed and acceleration."""
+"""Outcomes that count as a success."""

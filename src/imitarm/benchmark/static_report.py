@@ -1,6 +1,6 @@
-"""The results of the static benchmark as one self-contained HTML page: charts, tables, and playback of failures.
+"""Write the results of the static benchmark as one HTML page with charts, tables, and playbacks of failures.
 
-Results hold no paths. The experiments are deterministic, so the report repeats each plan that it draws.
+The results do not contain the planned paths. To draw a path, the report plans it again, which gives the same path.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ _MARKERS: Final = "osD^vP*X<>hd"
 _PLAYED: Final = 6  # failures that are drawn when none is named
 _RATE: Final = 25.0  # [1/s] frames
 _WORDS: Final = {
-    "Success": "The path touches no obstacle, meets start, goal and contact point, and can be executed within twice "
-    "the learned duration and within the limits of speed and acceleration.",
+    "Success": "The path touches no obstacle and meets start, goal and contact point. Within the limits of speed and "
+    "acceleration, the motion takes at most twice the learned duration.",
     "Oracle": "An independent search that decides which scenes have a solution.",
     "RMSE": "Root mean square distance from the learned path at equal fractions of the durations.",
     "SPARC": "Spectral arc length of the speed: the closer to 0, the smoother the motion.",
@@ -64,7 +64,8 @@ def write_static_report(
         tables: tables that the command also prints.
         path: the file to write; its folder must exist.
         provenance: facts needed to repeat the benchmark.
-        scenes: scenes to draw, as family, dimension and seed; if empty, failures are chosen.
+        scenes: scenes to draw, as family, dimension and seed. If empty, the report draws one failure of each method, at
+            most six.
 
     Raises:
         InputError: when the file can't be written, a scene has no result, or the drawing libraries are not installed.
@@ -80,7 +81,7 @@ def static_report_html(
     provenance: Mapping[str, Any],
     scenes: Sequence[tuple[str, int, int]] = (),
 ) -> str:
-    """Return the whole page; see :func:`write_static_report`."""
+    """Return the whole page as HTML; for the arguments, see :func:`write_static_report`."""
     chosen = _named(results, scenes) if scenes else _failures(results)
     shared, tabs = _tabs(chosen)
     found = results.of(OURS, results.solvable)
@@ -116,13 +117,13 @@ def _figures(results: StaticResults) -> list[Figure]:
         Figure(success_chart(results, family), f"Success: {place(family)}", lines) for family in results.families()
     ]
     found.append(
-        Figure(obstacles_chart(results), "Success by the number of obstacles", "Over the scenes that have a solution.")
+        Figure(obstacles_chart(results), "Success by the number of obstacles", "Only scenes that have a solution.")
     )
     for name, unit, title in (
         ("plan_seconds", "time to compute [s]", "Fig 4.9: time to compute"),
         ("duration", "time to complete [s]", "Fig 4.9: time to complete"),
     ):
-        found.append(Figure(tasks_chart(results, name, unit), title, "Medians over the successes of each task."))
+        found.append(Figure(tasks_chart(results, name, unit), title, "Medians over the successful plans in each task."))
     return found
 
 
@@ -153,13 +154,13 @@ def success_chart(results: StaticResults, family: tuple[str, int]) -> str:
 
 
 def obstacles_chart(results: StaticResults) -> str:
-    """Draw the rate of success over the number of obstacles, one line for each method."""
+    """Draw the rate of success of each method against the number of obstacles."""
     numbers = sorted({int(r.value("n_obstacles")) for r in results.all if math.isfinite(r.value("n_obstacles"))})
     rows = [row for row in results.rows if row not in CONTROLS]
     if len(numbers) < 2 or not rows:
         return ""
     size = (5.5, 2.6 + 0.1 * len(rows))
-    with canvas("obstacles", "Rate of success over the number of obstacles", size) as drawing:
+    with canvas("obstacles", "Rate of success by the number of obstacles", size) as drawing:
         axes = drawing.axes(0.6, 0.5 + 0.1 * len(rows), 5.35, size[1] - 0.1)
         for i, row in enumerate(rows):
             counts: dict[int, list[bool]] = {n: [] for n in numbers}
@@ -177,9 +178,9 @@ def obstacles_chart(results: StaticResults) -> str:
 
 
 def tasks_chart(results: StaticResults, name: str, unit: str) -> str:
-    """Draw the time called ``name`` for each task T1 to T8, with one line for each method.
+    """Draw the time ``name`` (a measure of the results) of each method in each task T1 to T8.
 
-    Computing times have a logarithmic scale.
+    Computing times are drawn on a logarithmic scale.
     """
     found = times_by_task(results, name)
     if not found:
@@ -206,7 +207,10 @@ def _named(results: StaticResults, scenes: Sequence[tuple[str, int, int]]) -> li
     for scene in scenes:
         rows = next((rows for s, rows in results.by_scene.items() if s[:3] == tuple(scene)), None)
         if rows is None:
-            raise InputError(f"{place(scene[:2])}, seed {scene[2]}: there is no result of this scene")
+            raise InputError(
+                f"{place(scene[:2])}, seed {scene[2]}: there is no result of this scene; run the benchmark with this "
+                "seed"
+            )
         chosen += [rows[row] for row in results.rows if row in rows and row not in CONTROLS]
     return chosen
 
@@ -246,7 +250,10 @@ def _tabs(chosen: Sequence[StaticResult]) -> tuple[tuple[str, str] | None, list[
         e = result.experiment
         title = f"{row_name(e)}: {place((e.family, e.dimension))}, seed {e.seed}"
         facts = {"Outcome": result.outcome, "Reason": result.reason or "–"}
-        caption = "Dashed lines: the required clearance. If the method refused, the learned path is drawn."
+        caption = (
+            "Dashed lines: required clearance around the obstacles. If the method refused the scene, the learned path "
+            "is drawn."
+        )
         player = Player(title, own[key], keys)
         content = {"facts": facts, "figure": Figure(svg, "Learned and planned path", caption), "player": player}
         tabs.append(Tab(key, title, content))
@@ -254,7 +261,7 @@ def _tabs(chosen: Sequence[StaticResult]) -> tuple[tuple[str, str] | None, list[
 
 
 def recording_of(case: StaticCase, path: Trajectory) -> Recording:
-    """Return a recording of the tool that moves along a path among the obstacles."""
+    """Return a recording for the playback, in which the tool moves along a path among the obstacles."""
     spec = mujoco.MjSpec()
     add_obstacles(spec, case.scene)
     tool = spec.worldbody.add_body(name="tool", mocap=True)

@@ -1,7 +1,7 @@
-"""How computing time and success depend on the number of obstacles and on the number of spheres that cover the tool.
+"""Measure how computing time and success depend on the number of obstacles and on the number of the tool's spheres.
 
-The scenes have 1 to 20 obstacles around the path of the packaged sweep, the first of them on the path. Whether a scene
-has a solution is not known.
+The scenes have 1 to 20 obstacles near the path of the packaged sweep. The first obstacle is on the path. Some scenes
+may have no solution. Spheres cover the tool, so that distances to the tool can be computed.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ _DRAWS = 2000
 
 @dataclass(frozen=True)
 class Plan:
-    """One plan in a scene with a given number of obstacles or spheres.
+    """The result of one plan in a scene with a given number of obstacles or spheres.
 
     Attributes:
-        n: the number.
+        n: number of obstacles or spheres.
         seconds: processor time of the plan [s].
         outcome: see :data:`~imitarm.benchmark.static_measures.OUTCOMES`.
     """
@@ -63,7 +63,10 @@ def _sweep() -> Skill:
 
 
 def scaling_case(n_obstacles: int, n_spheres: int, seed: int) -> StaticCase:
-    """Return a scene with these numbers of obstacles and spheres; a larger number only adds obstacles or spheres."""
+    """Return a scene with the given numbers of obstacles and spheres.
+
+    A larger number of obstacles only adds obstacles.
+    """
     skill, rng = _sweep(), np.random.default_rng([41, seed])
     path = skill.nominal(np.linspace(0.0, skill.duration_, 400)).positions
     free = _RADIUS + _LENGTH + CLEARANCE + _FREE
@@ -82,7 +85,7 @@ def scaling_case(n_obstacles: int, n_spheres: int, seed: int) -> StaticCase:
 
 
 def plan_once(method: str, case: StaticCase, n: int) -> Plan:
-    """Let a method plan in a scene, and measure its processor time."""
+    """Plan a path with a method in a scene, and return its processor time and outcome."""
     policy = build(method, case)
     began = time.process_time()
     try:
@@ -96,7 +99,7 @@ def plan_once(method: str, case: StaticCase, n: int) -> Plan:
 
 
 def exponent(plans: Sequence[Plan]) -> tuple[float, float]:
-    """Return the exponent b of ``time = a n^b``, fitted to the logarithms by least squares, and its standard error."""
+    """Return the exponent b of the power law ``time = a n^b``, and its standard error."""
     known = [p for p in plans if p.seconds > 0.0]
     x, y = np.log([p.n for p in known]), np.log([p.seconds for p in known])
     if len(known) < 3 or not np.ptp(x) > 0.0:
@@ -109,12 +112,12 @@ def exponent(plans: Sequence[Plan]) -> tuple[float, float]:
 def scaling_tables(
     methods: Sequence[str], seeds: Sequence[int], on_done: Callable[[int, int], None] | None = None
 ) -> list[Table]:
-    """Return two tables: one for a varying number of obstacles, and one for a varying number of spheres.
+    """Return two tables of time and success: one by the number of obstacles, and one by the number of spheres.
 
     Args:
         methods: names of the methods.
         seeds: seeds of the scenes.
-        on_done: function called with the number of finished plans and the total number.
+        on_done: function that is called after each plan, with the number of finished plans and the number of all plans.
     """
     cases = [[scaling_case(n, 1, seed) for n in OBSTACLES for seed in seeds]]
     cases.append([scaling_case(_FEW, n, seed) for n in SPHERES for seed in seeds])
@@ -134,9 +137,10 @@ def scaling_tables(
         columns = ("method", *(f"{n}>" for n in many), "exponent (standard error)>")
         note = (
             "Median processor time of a plan [ms], and in brackets the rate of success in percent with its Wilson "
-            "interval. The exponent belongs to a power law, which is fitted to all plans."
+            "interval. Exponent: b of the power law time = a n^b, which is fitted to all plans of the row; n is the "
+            "number at the top of the column."
         )
-        title = f"Time and success over the number of {what}, {len(seeds)} scenes each"
+        title = f"Time and success by the number of {what}, {len(seeds)} scenes for each number"
         tables.append(Table(title, columns, tuple(rows), note))
     return tables
 

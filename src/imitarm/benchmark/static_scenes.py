@@ -1,20 +1,20 @@
-"""Static scenes of ``imitarm benchmark static``: each family of obstacles is a different difficulty.
+"""Static scenes of ``imitarm benchmark static``. Each family of scenes has a different kind of obstacles.
 
-| family | obstacles | known from the construction of the scene |
+| family | obstacles | does the construction of the scene guarantee a solution? |
 |---|---|---|
-| S1 | sparse: 1 or 2 spheres and boxes on the path | solvable |
-| S2 | dense: 4 to 8 spheres and boxes on and beside the path | nothing |
-| S3 | mixed: 1 to 3 obstacles of all shapes on the path | solvable |
-| S4 | a wall with a gap, 1.2 to 3 times as wide as the tool | solvable, or not |
-| S5 | a trap: three boxes in the shape of a U that opens towards the path, 5 to 20 cm deep | solvable |
-| S6 | an obstacle over the start, the goal or a contact point | not solvable |
-| S7 | the sweep around 2 to 4 boxes and cones: the scenes T1 to T8 with small changes | nothing |
-| S9 | reach into an open box, with 1 to 3 obstacles on the path | nothing |
+| S1 | sparse: 1 or 2 spheres and boxes on the path | yes |
+| S2 | dense: 4 to 8 spheres and boxes on and beside the path | unknown |
+| S3 | mixed: 1 to 3 obstacles of all shapes on the path | yes |
+| S4 | a wall with a gap, 1.2 to 3 times as wide as the tool | depends on the width of the gap |
+| S5 | a trap: three boxes in the shape of a U that opens towards the path, 5 to 20 cm deep | yes |
+| S6 | an obstacle over the start, the goal or a contact point | no solution |
+| S7 | the sweep around 2 to 4 boxes and cones: the scenes T1 to T8 with small changes | unknown |
+| S9 | reach into an open box, with 1 to 3 obstacles on the path | unknown |
 
-S1 to S6 are scenes around an S-shaped reach, S7 around the sweep of :class:`~imitarm.tasks.sweep.SweepTask`, and S9
-around the reach of :class:`~imitarm.tasks.open_box.OpenBoxTask`. Scenes for the whole arm (S8) are in
-:mod:`imitarm.benchmark.placements`. On the learned path, the tool would touch an obstacle in every scene except those
-of S6.
+The learned motion is an S-shaped reach in S1 to S6, the sweep of :class:`~imitarm.tasks.sweep.SweepTask` in S7, and the
+reach of :class:`~imitarm.tasks.open_box.OpenBoxTask` in S9. Scenes for the whole arm (S8) are in
+:mod:`imitarm.benchmark.placements`. In every scene except those of S6, a tool on the learned path would touch an
+obstacle.
 """
 
 from __future__ import annotations
@@ -72,20 +72,23 @@ _MIDDLE = 0.3, 0.7  # fractions of the path between which a contact point or a t
 
 @dataclass(frozen=True, eq=False)
 class StaticCase:
-    """One static scene around the path of a skill, which a method must solve or refuse.
+    """One static scene around the path of a skill.
+
+    A method must solve the scene if a solution exists, and refuse it otherwise.
 
     Attributes:
         family: name of the family, one of :data:`FAMILIES`.
-        dimension: 2 when the path may only be displaced horizontally, else 3.
-        seed: number of the scene.
-        skill: the skill whose path is blocked.
-        scene: the obstacles; the motion has the learned start and goal.
+        dimension: 2 if the method may displace the path only horizontally; 3 if every direction is allowed.
+        seed: seed of the scene.
+        skill: the skill whose path the obstacles block.
+        scene: the obstacles. The motion keeps its learned start and goal.
         tool_spheres: spheres that cover the tool, rows x y z radius in the tool's frame, shape (m, 4) [m].
         clearance: required [m].
         forbidden: directions in which the path must not be displaced.
-        pinned: times at which the path must not be displaced, because the tool meets something there [s].
-        must_refuse: True if no path exists, False if a path exists; None if the construction of the scene does not
-            tell.
+        pinned: times at which the path must not be displaced [s]. At these times, the tool meets a contact point, such
+            as dirt.
+        must_refuse: True if no path exists; False if a path exists; None if the construction of the scene does not
+            decide it.
         n_samples: number of samples along the path.
     """
 
@@ -141,10 +144,10 @@ class _Family(NamedTuple):
 
 @lru_cache(maxsize=32)
 def learned_skill(family: str, dimension: int, teachers: int = 1) -> Skill:
-    """Learn the motion of a family of scenes from several teachers, with 8 components.
+    """Learn the skill of a family of scenes from synthetic teachers, with 8 Gaussian components.
 
     Args:
-        family: one of :data:`FAMILIES`; families with the same motion have the same skill.
+        family: one of :data:`FAMILIES`. Families with the same motion have the same skill.
         dimension: 2 or 3.
         teachers: number of teachers, with eight demonstrations each.
     """
@@ -171,15 +174,16 @@ def static_case(
     skill: Skill | None = None,
     n_obstacles: int | None = None,
 ) -> StaticCase:
-    """Return one static scene; the same arguments give the same scene on every machine.
+    """Return one static scene. The same arguments give the same scene on every machine.
 
     Args:
         family: one of :data:`FAMILIES`.
-        dimension: 2 when the path may only be displaced horizontally, else 3.
-        seed: number of the scene; :data:`SPLITS` says which seeds are for training, for tuning and for testing.
+        dimension: 2 if the method may displace the path only horizontally; 3 if every direction is allowed.
+        seed: seed of the scene. :data:`SPLITS` lists the seeds for training, for tuning and for testing.
         teachers: number of teachers from whom the skill was learned.
-        skill: another skill, for the families in :data:`ANY_SKILL`.
-        n_obstacles: number of obstacles, only for the family S2; None: a random number.
+        skill: skill whose path the obstacles block, only for the families in :data:`ANY_SKILL`; None: the skill of the
+            family.
+        n_obstacles: number of obstacles, only for the family S2; None: the seed determines the number.
 
     Raises:
         UnknownNameError: when there is no such family.
@@ -191,11 +195,13 @@ def static_case(
         raise InputError(f"static_case: dimension must be 2 or 3 and seed at least 0, got {dimension} and {seed}")
     if skill is not None and family not in ANY_SKILL:
         raise InputError(
-            f"static_case: scenes of {family} are made for its own skill; with skill=..., choose one of "
+            f"static_case: scenes of {family} need the skill of this family; omit skill=..., or choose a family from "
             f"{', '.join(ANY_SKILL)}"
         )
     if n_obstacles is not None and (family != "S2" or n_obstacles < 1):
-        raise InputError(f"static_case: n_obstacles needs the family S2 and at least 1, got {family} and {n_obstacles}")
+        raise InputError(
+            f"static_case: n_obstacles must be at least 1 and needs the family S2, got {n_obstacles} and {family}"
+        )
     rng = np.random.default_rng([int(family[1:]), dimension, seed])
     its = _FAMILIES[family]
     own = learned_skill(family, dimension, teachers) if skill is None else skill
@@ -233,7 +239,9 @@ def _blocking(family: _Family, draw: _Draw) -> _Placed:
         blocked = float(np.min(scene.clearance(draw.path))) < family.tool_radius - BLOCKED
         if blocked and float(np.min(scene.clearance(draw.path[fixed]))) >= family.tool_radius + CLEARANCE + _FREE:
             return placed
-    raise InputError("no scene blocks the path and leaves its ends free; choose the skill of a longer path")
+    raise InputError(
+        "no scene could be made in which obstacles block the path but not its ends; choose a skill with a longer path"
+    )
 
 
 def _sparse(draw: _Draw) -> _Placed:

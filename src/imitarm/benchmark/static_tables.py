@@ -1,7 +1,7 @@
-"""Tables of the static benchmark: scenes, success, refusals, quality of the paths, computing time.
+"""Tables of the static benchmark: scenes, success, refusals, quality of the paths, and computing time.
 
-A method with tuned options has its own row. The rate of success counts only the scenes that the oracle solves; the
-first table states how many scenes this excludes.
+A method with tuned options has its own row. The rate of success counts only scenes that have a solution.
+:func:`scenes_table` states how many scenes are excluded.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ OURS = "acfra"
 ORACLE = "oracle"
 POSSIBLE, IMPOSSIBLE, UNDECIDED = "possible", "impossible", "undecided"
 TASKS_FAMILY, N_TASKS = "S7", 8
-"""The family of the sweeping tasks T1 to T8, and the number of tasks. The seed s gives the task T(1 + s modulo 8)."""
+"""The family of the sweeping tasks T1 to T8, and the number of these tasks. A seed s gives the task with number 1 + s
+modulo 8."""
 
 
 def _largest_miss(result: StaticResult) -> float:
@@ -37,7 +38,7 @@ def _largest_miss(result: StaticResult) -> float:
 
 
 def row_name(experiment: StaticExperiment) -> str:
-    """Return the name of a row: the method, and whether its options are tuned."""
+    """Return the name of the table row of an experiment: the method, and whether its options are tuned."""
     if not experiment.options:
         return experiment.method
     if experiment.options == tuned_options(experiment.method):
@@ -50,11 +51,11 @@ class StaticResults:
     """Results of many experiments, by scene and by row of the tables.
 
     Args:
-        results: the results; if an experiment has several results, the last result counts.
+        results: the results. If an experiment has several results, the last result counts.
 
     Attributes:
         all: all results.
-        rows: names of the rows, the controls last.
+        rows: names of the rows; the controls come last.
         by_scene: for each scene, the result of each row.
     """
 
@@ -71,10 +72,10 @@ class StaticResults:
 
     @cached_property
     def answers(self) -> dict[Scene, str]:
-        """For each scene, whether a solution exists: "possible", "impossible" or "undecided", as the oracle answers.
+        """For each scene, whether a solution exists: "possible", "impossible" or "undecided".
 
-        If the oracle was not run, the construction of the scene gives the answer. If it does not, the answer is
-        "possible" if a method succeeded, and otherwise "undecided".
+        The answer is that of the oracle. Without the oracle, the construction of the scene may give the answer.
+        Otherwise the answer is "possible" if a method succeeded, and "undecided" if no method succeeded.
         """
         found = {}
         for scene, rows in self.by_scene.items():
@@ -90,14 +91,13 @@ class StaticResults:
         return found
 
     def beyond_proof(self, *, exact: bool) -> list[StaticResult]:
-        """Return the successes in scenes in which the oracle proves that no path keeps the clearance.
+        """Return the successes in scenes for which the oracle proved that no path keeps the clearance.
 
-        The proof holds for paths that pass exactly through start, goal and contact point. A success may miss them by up
-        to 5 mm, so only a success that passes through them contradicts the oracle.
+        The proof is valid for paths that pass exactly through start, goal and contact point. A success may miss these
+        points by up to 5 mm. Therefore only a success that passes exactly through them contradicts the oracle.
 
         Args:
-            exact: True for the successes that pass through all these points, and so contradict the oracle; False for
-                the other successes.
+            exact: True: return the successes that pass exactly through these points. False: return the other successes.
         """
         found = [r for r in self.all if r.outcome == "success" and self.answers[r.experiment.scene] == IMPOSSIBLE]
         return [r for r in found if exact == (_largest_miss(r) <= SLACK)]
@@ -107,7 +107,7 @@ class StaticResults:
         return list(dict.fromkeys(scene[:2] for scene in self.by_scene))
 
     def of(self, row: str, wanted: Callable[[Scene], bool]) -> list[StaticResult]:
-        """Return the results of a row in the scenes for which ``wanted`` is true."""
+        """Return the results of a row in the scenes for which the function ``wanted`` returns True."""
         return [rows[row] for scene, rows in self.by_scene.items() if row in rows and wanted(scene)]
 
     def solvable(self, scene: Scene) -> bool:
@@ -116,7 +116,7 @@ class StaticResults:
 
     @cached_property
     def main_teachers(self) -> int:
-        """The number of teachers that occurs in the largest number of scenes."""
+        """The number of teachers that most scenes have."""
         counts = [scene[3] for scene in self.by_scene]
         return max(set(counts), key=counts.count)
 
@@ -126,10 +126,10 @@ class StaticResults:
         return all(scene[4] for scene in self.by_scene)
 
     def usual(self, scene: Scene) -> bool:
-        """Return whether most tables count a scene.
+        """Return whether the scene counts in the tables that do not vary teachers or skills.
 
-        Its skill must be learned from the usual number of teachers. Scenes with skills from files count only if there
-        are no others.
+        A scene counts if its skill has :attr:`main_teachers` teachers. A scene with a skill from a file counts only if
+        there are no other scenes.
         """
         return scene[3] == self.main_teachers and (self.only_files or not scene[4])
 
@@ -148,24 +148,24 @@ def rate(count: int, of: int) -> str:
 
 
 def mean(values: Sequence[float], factor: float = 1.0, digits: int = 1) -> str:
-    """Return the mean of the values that are known, as text."""
+    """Return the mean of the finite values as text, multiplied by ``factor``."""
     known = [v for v in values if math.isfinite(v)]
     return f"{factor * float(np.mean(known)):.{digits}f}" if known else "–"
 
 
 def percentile(values: Sequence[float], q: float, factor: float = 1.0, digits: int = 1) -> str:
-    """Return a percentile of the values that are known, as text."""
+    """Return the percentile ``q`` of the finite values as text, multiplied by ``factor``."""
     known = [v for v in values if math.isfinite(v)]
     return f"{factor * float(np.percentile(known, q)):.{digits}f}" if known else "–"
 
 
 def place(family: tuple[str, int] | None) -> str:
-    """Return the name of a family with its dimension; None stands for all families."""
+    """Return a family and its dimension as text, such as "S1, 2-D"; "all" for None."""
     return "all" if family is None else f"{family[0]}, {family[1]}-D"
 
 
 def scenes_table(results: StaticResults) -> Table:
-    """Return a table of the number of scenes, and of the number of scenes that have a solution."""
+    """Return a table of the number of scenes of each family, and of the scenes that have a solution."""
     rows = []
     for family in [*results.families(), None]:
         scenes = [s for s in results.by_scene if results.usual(s) and family in (None, s[:2])]
@@ -185,20 +185,20 @@ def scenes_table(results: StaticResults) -> Table:
     )
     checked = sum(ORACLE in rows_ for rows_ in results.by_scene.values())
     verdict = (
-        "In scenes that the oracle proves impossible, no path through the exact start, goal and contact point keeps "
+        "If the oracle proves that a scene is impossible, no path exactly through start, goal and contact point keeps "
         "the clearance."
     )
     if wrong:
         verdict = f"The oracle is wrong. A method solves a scene that the oracle calls impossible: {'; '.join(wrong)}."
     if missing:
         verdict += (
-            " A path that misses these points by up to "
-            f"{1e3 * AT_GOAL:.0f} mm counts as success, and keeps the clearance in such a scene: {'; '.join(missing)}."
+            f" A path that misses these points by up to {1e3 * AT_GOAL:.0f} mm counts as a success. Such a path keeps "
+            f"the clearance in an impossible scene: {'; '.join(missing)}."
         )
     note = (
-        f"The oracle was run in {checked} of {len(results.by_scene)} scenes; a scene without the oracle's answer "
-        "counts as possible if its construction or a path that keeps the clearance shows it. Only the scenes with a "
-        f"solution count in the rates of success. {verdict}"
+        f"The oracle was run in {checked} of {len(results.by_scene)} scenes. In all other scenes, the construction of "
+        "the scene or a path that keeps the clearance may show that the scene is possible. The rates of success count "
+        f"only possible scenes. {verdict}"
     )
     columns = ("family", "scenes>", "possible>", "impossible>", "undecided>", "undecided, but solved by a method>")
     return Table("Scenes", columns, tuple(rows), note)
@@ -230,9 +230,9 @@ def success_table(results: StaticResults, families: Sequence[tuple[str, int] | N
         "clearance of successes, 5th percentile [mm]>",
     )
     note = (
-        "Success: no contact at 4000 points of the path; start, goal and contact point met within 5 mm; at most twice "
-        f"the learned duration when executed with at most {MAX_SPEED:g} m/s and {MAX_ACCELERATION:g} m/s^2. "
-        "Intervals: Wilson."
+        "A path succeeds if it touches nothing at 4000 points and meets start, goal and contact point within 5 mm. "
+        f"With at most {MAX_SPEED:g} m/s and {MAX_ACCELERATION:g} m/s^2, the motion must take at most twice the "
+        "learned duration. Intervals: Wilson."
     )
     return Table("Success" if tuple(families) == (None,) else "Success in each family", columns, tuple(rows), note)
 
@@ -252,7 +252,7 @@ _OTHERS = ("contact", "missed goal", "late", "limit", "refused", "failed")
 
 
 def refusals_table(results: StaticResults) -> Table:
-    """Return a table of right and wrong refusals."""
+    """Return a table of the right and the wrong refusals of each method."""
     rows = []
     for row in results.rows:
         if row == ORACLE:
@@ -276,18 +276,20 @@ def refusals_table(results: StaticResults) -> Table:
         "method",
         "impossible scenes>",
         "refused, rightly % (95 %)>",
-        "contact in them>",
-        "refused, although possible % (95 %)>",
-        "refused, undecided>",
+        "contact in impossible scenes>",
+        "refused, but possible % (95 %)>",
+        "refused undecided scenes>",
     )
-    return Table("Refusals", columns, tuple(rows), "A method that never refuses moves in impossible scenes as well.")
+    return Table(
+        "Refusals", columns, tuple(rows), "A method that never refuses also moves the tool in impossible scenes."
+    )
 
 
 def checked_refusals_table(results: StaticResults, row: str = OURS) -> Table:
-    """Return a table of the refusals of one method, each checked by the oracle, for each family.
+    """Return a table of the refusals of one method in each family. The oracle has checked each refusal.
 
     Args:
-        results: the results. The oracle must have been run wherever the method refused.
+        results: the results. They must include the oracle in every scene that the method refused.
         row: the method.
     """
     rows, doubtful = [], []
@@ -327,14 +329,14 @@ def checked_refusals_table(results: StaticResults, row: str = OURS) -> Table:
     )
     note = (
         f"The oracle checked every refusal of {row}. Right: the oracle proves that no path exists. Wrong: the oracle "
-        "finds a path. An undecided refusal counts as not right. Times of the oracle: processor time of one scene. "
+        "finds a path. Undecided: the oracle finds neither a proof nor a path. Oracle: processor time of one scene. "
         f"Refusals that are not right: {'; '.join(doubtful) or 'none'}."
     )
     return Table(f"Refusals of {row}", columns, tuple(rows), note)
 
 
 def quality_table(results: StaticResults) -> Table:
-    """Return a table of the quality of the paths, over the successes of each method."""
+    """Return a table of the quality of the successful paths of each method."""
     rows = []
     for row in results.rows:
         found = results.of(row, lambda s: results.solvable(s) and results.usual(s))
@@ -374,17 +376,17 @@ def quality_table(results: StaticResults) -> Table:
         "torque RMS [N m]>",
     )
     note = (
-        "Means over the successes of each method. Different methods succeed in different scenes; the paired "
-        "comparison uses common scenes. RMSE: distance from the learned path at equal fractions of the durations "
-        "(thesis Eq 4.9, with the square root); unaffected: RMSE over the samples at which the tool is farther than "
-        f"{1e2 * NEAR:.0f} cm from every obstacle; of the path: RMSE from the nearest point of the path. Length and "
-        "duration of the execution are divided by those of the learned path."
+        "Means over the successes of each method. The methods succeed in different scenes; the paired comparison uses "
+        "common scenes. RMSE: distance between planned and learned path at equal fractions of their durations (thesis "
+        "Eq 4.9, with the square root). Unaffected samples: samples of the learned path at which the tool is farther "
+        f"than {1e2 * NEAR:.0f} cm from every obstacle. RMSE of the path: distance from each sample of the learned "
+        "path to the nearest point of the planned path. Length and duration are divided by those of the learned path."
     )
     return Table("Quality of the successful paths", columns, tuple(rows), note)
 
 
 def time_table(results: StaticResults) -> Table:
-    """Return a table of computing time and memory of one path of the tool."""
+    """Return a table of the computing time and the memory that each method needs for one path."""
     rows = []
     for row in results.rows:
         found = results.of(row, results.usual)
@@ -416,10 +418,9 @@ def time_table(results: StaticResults) -> Table:
         "peak memory, median [kB]>",
     )
     note = (
-        "Time to plan one whole path, without the construction of the policy. In each process, a method first plans "
-        "once for each skill without a clock. Imports and computations that are made once for a skill are therefore "
-        "not counted. Training of networks and cost functions is not counted either. Peak memory: the largest memory "
-        "that Python allocates in a separate run."
+        "Time to plan one whole path, without the construction of the policy. Computations that a process makes only "
+        "once for a skill, imports, and the training of networks and cost functions are not counted. Peak memory: "
+        "largest memory that Python allocates in a separate run."
     )
     return Table("Computing time", columns, tuple(rows), note)
 
@@ -440,5 +441,5 @@ def obstacles_table(results: StaticResults) -> Table:
         "Success by the number of obstacles, % (95 %)",
         ("method", *(f"{n}>" for n in numbers)),
         tuple(rows),
-        "All scenes that have a solution, of all families.",
+        "All scenes of all families that have a solution.",
     )

@@ -1,7 +1,8 @@
-"""Tuning of the static benchmark: the same random search for every method, on scenes that are not used for testing.
+"""Tune the options of the methods of the static benchmark by a random search, in scenes that are not used for testing.
 
-Each option of a method's ``search_space`` is drawn log-uniformly. The best draw has the highest rate of success on the
-validation scenes. Among draws with the same rate, the best draw has the smallest mean RMSE of its successes.
+The ``search_space`` of a method lists its options and their ranges. A draw contains a random value of each option,
+uniform in its logarithm. The best draw has the highest rate of success in the validation scenes. If several draws have
+this rate, the best draw has the smallest mean RMSE of its successes.
 """
 
 from __future__ import annotations
@@ -31,15 +32,15 @@ _SHIPPED = "tuned_static.json"
 
 @dataclass(frozen=True)
 class Search:
-    """A random search.
+    """The definition of a random search.
 
     Attributes:
-        scenes: scenes on which each draw is tried, each as family, dimension and seed.
-        draws: number of draws for each method, the first of which has the default options.
+        scenes: validation scenes in which each draw is tried, each as family, dimension and seed.
+        draws: number of draws for each method. The first draw has the default options.
         seed: seed of the draws.
 
     Raises:
-        InputError: when there is nothing to search.
+        InputError: when there is no scene or no draw.
     """
 
     scenes: tuple[tuple[str, int, int], ...]
@@ -51,7 +52,7 @@ class Search:
             raise InputError("tuning needs at least one scene and one draw")
 
     def options(self, method: str) -> list[Options]:
-        """Return the options of each draw of a method; if its search space is empty, there is only the default draw."""
+        """Return the options of each draw of a method. If the search space is empty, there is only the default draw."""
         space = policy_class(method).search_space
         rng = np.random.default_rng([self.seed, *method.encode()])
         drawn: list[Options] = [()]
@@ -70,10 +71,10 @@ class Draw:
 
     Attributes:
         method: name of the method.
-        number: number of the draw; 0 has the default options.
+        number: number of the draw. Draw 0 has the default options.
         options: options of the draw.
-        success: rate of success.
-        rmse: mean RMSE of the successes [m]; nan without any.
+        success: rate of success in the validation scenes, from 0 to 1.
+        rmse: mean RMSE of the successes [m]; nan if there is no success.
     """
 
     method: str
@@ -84,12 +85,12 @@ class Draw:
 
     @property
     def order(self) -> tuple[float, float]:
-        """Sort key of a draw; the best draw has the smallest key."""
+        """Sort key of a draw. The best draw has the smallest key."""
         return -self.success, self.rmse if math.isfinite(self.rmse) else math.inf
 
 
 def score(method: str, number: int, options: Options, results: Sequence[StaticResult]) -> Draw:
-    """Return the score of one draw from its results in all scenes."""
+    """Return the score of one draw, computed from its results in all validation scenes."""
     good = [r.value("rmse") for r in results if r.outcome in SUCCESSES]
     return Draw(method, number, options, len(good) / len(results), float(np.mean(good)) if good else math.nan)
 
@@ -103,15 +104,15 @@ def tune(
     log: Path | None = None,
     on_done: OnDone | None = None,
 ) -> dict[str, Draw]:
-    """Search the options of each method, and return the best draws.
+    """Search for the best options of each method, and return the best draw of each method.
 
     Args:
         methods: names of the methods.
         search: the scenes, the number of draws and the seed of the search.
-        store: where the results are saved; an interrupted search continues where it stopped.
+        store: store that saves the results, so that an interrupted search can be continued.
         workers: the processes that run the experiments.
-        log: file in which each draw is a line of JSON.
-        on_done: function called with the progress.
+        log: file to which each draw is written as a line of JSON; None: no file.
+        on_done: function that is called with the progress after each experiment.
     """
     drawn = [(method, i, options) for method in methods for i, options in enumerate(search.options(method))]
     experiments = [
@@ -129,7 +130,7 @@ def tune(
 
 
 def write_tuned(best: dict[str, Draw], search: Search, path: Path) -> None:
-    """Write the best options of each method, with code version and configuration; keep other methods in the file."""
+    """Write the best options of each method to a file. Options of other methods in the file stay unchanged."""
     try:
         known = _read(path.read_text(encoding="utf-8"), str(path))["methods"] if path.exists() else {}
     except OSError as error:
@@ -157,7 +158,7 @@ def _shipped() -> dict[str, Options]:
 
 
 def tuned_options(method: str) -> Options:
-    """Return the tuned options of a method that the package contains; empty if its default options are the best."""
+    """Return the tuned options of a method from the package; empty if the default options are the best."""
     return _shipped().get(method, ())
 
 

@@ -1,4 +1,4 @@
-"""Table: results of a benchmark as rows of text, for a terminal, a report page or a Markdown document."""
+"""Tables of results as rows of text, for a terminal, a report page or a Markdown document."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ END = "<!-- end -->"
 
 @dataclass(frozen=True)
 class Table:
-    """A table of text with title, columns, rows and note; a column whose name ends in ``>`` holds numbers."""
+    """A table of text with a title, columns, rows and a note. A column contains numbers if its name ends in ``>``."""
 
     title: str
     columns: tuple[str, ...]
@@ -31,7 +31,10 @@ class Table:
         return "\n".join([*lines, *(["", self.note] if self.note else []), ""])
 
     def for_page(self) -> dict[str, Any]:
-        """Return the table for a page template; ``kind`` tells whether a column holds words, numbers or a symbol."""
+        """Return the table for the template of a report page.
+
+        ``kind`` says whether a column contains words, numbers or symbols.
+        """
         columns = [
             {
                 "title": column.removesuffix(">"),
@@ -44,15 +47,16 @@ class Table:
 
 @dataclass(frozen=True)
 class Place:
-    """The place of a benchmark's tables in a Markdown document.
+    """The place in a Markdown document where the tables of a benchmark stand.
 
     Attributes:
         document: path of the Markdown document.
-        benchmark: name of the benchmark. In the document, the tables stand between two comment lines: :attr:`begin`,
-            which names the benchmark, and :data:`END`.
+        benchmark: name of the benchmark. The tables stand between two comment lines of the document. The first line is
+            :attr:`begin`, which contains this name. The second line is :data:`END`.
 
     Raises:
-        InputError: when the document can't be read, or does not contain the two comment lines once each, in this order.
+        InputError: when the document can't be read, or does not contain each of the two comment lines once, in this
+            order.
     """
 
     document: Path
@@ -63,16 +67,17 @@ class Place:
 
     @property
     def begin(self) -> str:
-        """The comment line that stands above the tables in the document."""
+        """The comment line above the tables in the document."""
         return f"<!-- imitarm benchmark {self.benchmark} -->"
 
     def fill(self, found: Sequence[Table], command: str, versions: Iterable[str]) -> None:
-        """Replace the tables in the document; the rest of the document stays unchanged.
+        """Replace the tables in the document. The rest of the document stays unchanged.
 
         Args:
             found: the tables.
             command: the command that printed the tables.
-            versions: code version of each result. If the running code has another version, the document says so.
+            versions: version of the code for each result. If the running code has another version, the document says
+                so.
         """
         head, tail = self._parts()
         body = "\n".join(table.markdown() for table in found)

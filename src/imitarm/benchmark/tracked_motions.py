@@ -1,4 +1,4 @@
-"""Recorded motions of a person's arm and of a trolley as moving obstacles with a known truth."""
+"""Recorded motions of a person's arm and of a trolley, as moving obstacles whose true positions are known."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class RecordedMotion:
         times: times of the samples, from 0 in steps of :data:`PERIOD`, shape (n,) [s].
         positions: centres of the obstacles, shape (n_obstacles, n, 3) [m].
         velocities: velocities of the obstacles' centres, shape (n_obstacles, n, 3) [m/s].
-        scene: the moving obstacles as a scene.
+        scene: scene that contains the moving obstacles.
     """
 
     name: str
@@ -52,14 +52,17 @@ class RecordedMotion:
         return float(self.times[-1])
 
     def at(self, obstacle: int, times: Array) -> tuple[Array, Array]:
-        """Return positions and velocities (..., 3) of one obstacle at ``times`` (...) [s]."""
+        """Return positions [m] and velocities [m/s] of one obstacle at ``times`` [s].
+
+        For times of shape (...), both arrays have the shape (..., 3).
+        """
         rows = np.stack([self.positions[obstacle], self.velocities[obstacle]])
         found = np.stack([[np.interp(times, self.times, column) for column in row.T] for row in rows])
         return np.moveaxis(found[0], 0, -1), np.moveaxis(found[1], 0, -1)
 
 
 def recorded_motions(data: Path) -> list[RecordedMotion]:
-    """Read both recordings.
+    """Read the recordings of the arm and of the trolley.
 
     Args:
         data: folder of real recordings, with the subfolders ``mocap_arm`` and ``mocap_trolley``.
@@ -71,7 +74,7 @@ def recorded_motions(data: Path) -> list[RecordedMotion]:
 
 
 def captured_arm(data: Path) -> RecordedMotion:
-    """Return a person's upper arm and forearm as two capsules at true scale."""
+    """Read the recorded motion of a person's arm: two capsules of the true length represent upper arm and forearm."""
     capture = MotionCapture.load(data / "mocap_arm" / "recording.tsv")
     times, joints, velocities = _resampled(capture.times, capture.points[:, :3], _SMOOTHING["arm"])
     middles = np.stack([0.5 * (joints[:, i] + joints[:, i + 1]) for i in range(2)])
@@ -88,7 +91,7 @@ def captured_arm(data: Path) -> RecordedMotion:
 
 
 def captured_trolley(data: Path) -> RecordedMotion:
-    """Return a trolley as an upright cylinder, at half scale in length and in time."""
+    """Read the recorded motion of a trolley: an upright cylinder. Its lengths and times are halved."""
     path = data / "mocap_trolley" / "mid.csv"
     try:
         with path.open(newline="", encoding="utf-8") as file:
