@@ -105,7 +105,7 @@ class ResultFormat(Generic[Work, Outcome]):
             here: list[Any] = [r for path in sorted(folder.glob(f"*{SUFFIX}")) for r in self.read(path)]
             found.update({saved.experiment: saved for saved in here})
             if not here:
-                raise InputError(f"{folder}: contains no results of '{self.command}'; name the folder that --out named")
+                raise InputError(f"{folder}: holds no results of '{self.command}'; name the folder that --out named")
         return list(found.values())
 
 

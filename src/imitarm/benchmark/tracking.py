@@ -1,4 +1,4 @@
-"""``imitarm benchmark tracking``: the tracker on real motion, with simulated noise, latency and dropouts."""
+"""``imitarm benchmark tracking``: track recorded motions, with simulated noise, latency and dropouts of the sensor."""
 
 from __future__ import annotations
 
@@ -36,18 +36,20 @@ CAMERA = 1.5  # [m] distance of the camera from the middle of the motion
 
 @dataclass(frozen=True, eq=False)
 class TrackLog:
-    """The truth and the tracker's estimate of one obstacle when each frame arrived; nan where it had no track.
+    """The true and the estimated motion of one obstacle, frame by frame.
+
+    Estimates are nan when the obstacle has no track.
 
     Attributes:
         times: time at which each frame arrived, shape (n,) [s].
         truth: true positions at these times, shape (n, 3) [m].
-        velocity: true velocities, shape (n, 3) [m/s].
-        raw: last detected positions, shape (n, 3) [m].
-        filtered: positions estimated for the time stamp of the frame, shape (n, 3) [m].
-        predicted: positions predicted to the time of arrival, shape (n, 3) [m].
-        estimated_velocity: velocities predicted to the time of arrival, shape (n, 3) [m/s].
-        nees: normalised estimation error squared at the time stamp of the frame, shape (n,).
-        ids: number of the track, shape (n,); -1 without a track.
+        velocity: true velocities at these times, shape (n, 3) [m/s].
+        raw: last detected position of the obstacle at each frame, shape (n, 3) [m].
+        filtered: positions that the tracker estimates for the time stamp of each frame, shape (n, 3) [m].
+        predicted: positions that the tracker predicts for the time at which each frame arrived, shape (n, 3) [m].
+        estimated_velocity: velocities that the tracker predicts for this time, shape (n, 3) [m/s].
+        nees: normalised estimation error squared at the time stamp of each frame, shape (n,).
+        ids: number of the obstacle's track at each frame, shape (n,); -1 if the obstacle has no track.
     """
 
     times: Array
@@ -62,11 +64,11 @@ class TrackLog:
 
     @property
     def settled(self) -> NDArray[np.bool_]:
-        """Which frames count: those after the first second in which the obstacle has a track, shape (n,)."""
+        """Whether each frame counts, shape (n,). A frame counts after the first second, if the obstacle has a track."""
         return (self.ids >= 0) & (self.times >= self.times[0] + _SETTLED)
 
     def lag(self, estimate: Array) -> float:
-        """Return the delay of an estimate (n, 3) [s]: the component of its error against the velocity, per speed."""
+        """Return the mean delay of an estimate, shape (n, 3) [m], behind the true position [s]."""
         used = self.settled & np.isfinite(estimate).all(axis=1)
         error, v = (estimate - self.truth)[used], self.velocity[used]
         return float(-(error * v).sum() / (v * v).sum())
@@ -78,8 +80,9 @@ class Tracking:
 
     Attributes:
         logs: one log for each obstacle.
-        nis: mean normalised innovation squared of each frame with an assigned detection, shape (m,).
-        times: time at which each of these frames arrived, shape (m,) [s].
+        nis: mean normalised innovation squared of each of the m frames in which a detection was assigned to a track,
+            shape (m,).
+        times: time at which each of these m frames arrived, shape (m,) [s].
         gate: largest normalised innovation squared with which the tracker assigns a detection to a track.
         seconds: processor time of each update, shape (n,) [s].
     """
@@ -92,17 +95,20 @@ class Tracking:
 
     @property
     def expected_nis(self) -> float:
-        """Mean normalised innovation squared of a correct filter whose detections are limited by the gate."""
+        """Mean normalised innovation squared of a correct filter.
+
+        The gate removes large innovations, so the mean is below 3.
+        """
         return chi_square_moments(3, self.gate)[0]
 
     @property
     def nees(self) -> Array:
-        """Normalised estimation error squared of all obstacles in all frames that count, shape (k,)."""
+        """Normalised estimation error squared of all obstacles, in the frames that count (:attr:`TrackLog.settled`)."""
         return np.concatenate([log.nees[log.settled] for log in self.logs])
 
 
 def with_camera(detections: Iterable[Detection], motion: RecordedMotion) -> list[Detection]:
-    """Return the detections of a simulated camera in front of the middle of the motion."""
+    """Return the detections with the pose of a simulated camera, which looks at the middle of the motion."""
     from imitarm.kinematics.pose import Pose  # noqa: PLC0415
 
     middle = motion.positions.reshape(-1, 3).mean(axis=0)
@@ -130,7 +136,7 @@ def follow(
         motion: the motion.
         tracker: a new tracker.
         sensor: the sensor.
-        part: part of the recording, as fractions of its duration.
+        part: start and end of the part of the recording that is used, as fractions of its duration.
     """
     frames = _frames(motion, sensor, *(fraction * (motion.duration - sensor.latency) for fraction in part))
     n, n_obstacles = len(frames), len(motion.names)
@@ -186,10 +192,10 @@ def _nearest(positions: Sequence[Array], truth: Array, last: Array) -> Array:
 
 
 def chosen_noise(motion: RecordedMotion, model: str, sensor: SensorModel = SENSOR) -> Noise:
-    """Return the process noise, from a grid, with which NIS and NEES are nearest to those of a correct filter.
+    """Return the process noise from a grid with which the filter is most consistent.
 
-    Only the first half of the recording is used. The mean of NIS and the mean of NEES are each divided by the value of
-    a correct filter. The distance is the sum of the squared logarithms of the two quotients.
+    The tracker follows the first half of the recording. The mean NIS and the mean NEES are each divided by the value of
+    a correct filter. The process noise minimises the sum of the squared logarithms of these two quotients.
     """
 
     def distance(noise: Noise) -> float:
@@ -205,7 +211,10 @@ def _rms(errors: Array) -> float:
 
 
 def accuracy_rows(motion: RecordedMotion, found: dict[str, Tracking]) -> list[tuple[str, ...]]:
-    """Return the rows of the table of errors: for each obstacle, the raw detections and each model of motion."""
+    """Return the rows of the table of errors.
+
+    Each obstacle has a row for the detections and a row for each model of motion.
+    """
     rows: list[tuple[str, ...]] = []
     for i, name in enumerate(motion.names):
         first = next(iter(found.values())).logs[i]
@@ -231,7 +240,7 @@ def _cells(log: TrackLog, estimate: Array) -> tuple[str, str, str]:
 def consistency_rows(
     motion: RecordedMotion, found: dict[str, Tracking], noises: dict[str, Noise]
 ) -> list[tuple[str, ...]]:
-    """Return the rows of the table of consistency: NIS and NEES with the block-bootstrap intervals of their means."""
+    """Return the rows of the table of consistency, with the means of NIS and NEES and their intervals."""
     rows: list[tuple[str, ...]] = []
     for model, tracking in found.items():
         times = np.concatenate([log.times[log.settled] for log in tracking.logs])
@@ -251,7 +260,7 @@ def _mean_cells(values: Array, times: Array, expected: float) -> tuple[str, str]
 
 
 def tracking_tables(motions: Sequence[RecordedMotion], sensor: SensorModel = SENSOR) -> list[Table]:
-    """Return the tables of errors and of consistency, measured on the second half of each recording."""
+    """Return a table of errors and a table of consistency, both measured in the second half of each recording."""
     accuracy: list[tuple[str, ...]] = []
     consistency: list[tuple[str, ...]] = []
     for motion in motions:
@@ -263,8 +272,9 @@ def tracking_tables(motions: Sequence[RecordedMotion], sensor: SensorModel = SEN
         accuracy += accuracy_rows(motion, found)
         consistency += consistency_rows(motion, found, noises)
     said = (
-        f"Noise {1e3 * sensor.noise:g} mm, {sensor.rate:g} Hz, latency {1e3 * sensor.latency:g} ms, "
-        f"dropout {100 * sensor.dropout:g} %. Errors are differences from the true position when a frame arrives."
+        f"Simulated sensor: noise {1e3 * sensor.noise:g} mm, {sensor.rate:g} Hz, latency {1e3 * sensor.latency:g} ms, "
+        f"dropout {100 * sensor.dropout:g} %. Errors: difference between the estimate and the true motion at the time "
+        "at which a frame arrives."
     )
     return [
         Table(
@@ -294,8 +304,9 @@ def tracking_tables(motions: Sequence[RecordedMotion], sensor: SensorModel = SEN
                 "processor time of an update [µs]>",
             ),
             tuple(consistency),
-            "The process noise was chosen on the first half of each recording, by NIS and NEES. Expected of a "
-            "correct filter: NEES 6 and NIS 2.89, which is below 3 because the gate removes large innovations. In "
-            f"brackets: block-bootstrap interval of the mean (95 %, blocks of {BLOCK:g} s).",
+            "The process noise was chosen in the first half of each recording, so that NIS and NEES are nearest to "
+            "those of a correct filter. A correct filter has a NEES of 6 and an NIS of 2.89. The NIS is below 3 "
+            "because the gate removes large innovations. In brackets: block-bootstrap interval of the mean (95 %, "
+            f"blocks of {BLOCK:g} s).",
         ),
     ]

@@ -1,4 +1,4 @@
-"""Margins for predicted obstacles: their coverage in synthetic windows and on real motion."""
+"""Measure how often the errors of predicted positions stay within a margin, for synthetic and for recorded motions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from imitarm.scene import MovingScene, Scene, Sphere
 Array = NDArray[np.float64]
 
 TIMES = np.linspace(0.0, 0.5, 6)
-"""Look-ahead times of the margins, from the arrival of a frame [s]."""
+"""Times after the arrival of a frame for which positions are predicted (look-ahead times) [s]."""
 COVERAGE = 0.95
 _CALIBRATION, _TEST, _REAL = 0, 1, 2  # streams of random numbers
 _TOGETHER = 30  # obstacles that one tracker follows at the same time
@@ -43,7 +43,7 @@ class Windows(NamedTuple):
 
 
 def random_motion(rng: np.random.Generator) -> Callable[[float], Array]:
-    """Return a random motion from the origin: steady, swaying, or stopping and going, at 0.1 to 0.6 m/s."""
+    """Return a random motion that begins near the origin: steady, swaying, or stop-and-go, at 0.1 to 0.6 m/s."""
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
     across = np.cross(direction, rng.normal(size=3))
@@ -66,12 +66,13 @@ def random_motion(rng: np.random.Generator) -> Callable[[float], Array]:
 def synthetic_windows(n: int, stream: int, sensor: SensorModel = SENSOR, seed: int = 0) -> Array:
     """Return the errors of ``n`` predictions of independent motions, shape (n, n_times) [m].
 
-    The tracker observes each obstacle for 1 s; then its position is predicted from the last frame that has arrived.
+    The tracker observes each obstacle for 1 s. It then predicts the positions of the obstacle at :data:`TIMES` after
+    the last frame.
 
     Args:
-        n: number of windows.
-        stream: number of an independent stream of random numbers.
-        sensor: the sensor; windows without a track after 1 s are replaced.
+        n: number of windows (a window is a prediction and the true motion after it).
+        stream: number of a stream of random numbers; different streams are independent.
+        sensor: the simulated sensor. A window in which the obstacle has no track after 1 s is replaced.
         seed: seed of the random numbers.
     """
     found: list[Array] = []
@@ -115,7 +116,7 @@ def _batch(rng: np.random.Generator, sensor: SensorModel) -> list[Array]:
 
 
 def recorded_windows(motion: RecordedMotion, part: tuple[float, float], sensor: SensorModel = SENSOR) -> Windows:
-    """Return the errors of predictions every 0.1 s on a recorded motion.
+    """Return the errors of predictions that begin every 0.1 s of a recorded motion.
 
     Args:
         motion: the motion.
@@ -143,10 +144,10 @@ def recorded_windows(motion: RecordedMotion, part: tuple[float, float], sensor: 
 
 
 def margin_table(n: int, motions: Sequence[RecordedMotion] = (), sensor: SensorModel = SENSOR, seed: int = 0) -> Table:
-    """Return the table of coverage, measured on windows that were not used for the calibration.
+    """Return a table of how many windows are within the margin. These windows were not used for the calibration.
 
     Args:
-        n: number of synthetic windows for testing; the same number is used for calibration.
+        n: number of synthetic windows for testing. Another n windows are used for calibration.
         motions: recorded motions.
         sensor: the sensor.
         seed: seed of the random numbers.
@@ -172,9 +173,9 @@ def margin_table(n: int, motions: Sequence[RecordedMotion] = (), sensor: SensorM
         "Coverage of margins",
         ("tested on", "calibrated on", "offset [mm]>", "growth [mm/s]>", "windows within the margin [%]>"),
         tuple(rows),
-        f"Look-ahead 0 to {TIMES[-1]:g} s from the arrival of a frame. A window is within the margin if its error is "
-        f"below the margin at all times of the window. Required: {100 * COVERAGE:g} %. In brackets: Wilson interval, "
-        f"or block-bootstrap interval (blocks of {BLOCK:g} s) on recorded motion.",
+        f"Predictions for 0 to {TIMES[-1]:g} s after the arrival of a frame. A window is within the margin if its "
+        f"error is below the margin at all times of the window. Required: {100 * COVERAGE:g} %. In brackets: Wilson "
+        f"interval for synthetic windows, block-bootstrap interval (blocks of {BLOCK:g} s) for recorded motion.",
     )
 
 

@@ -1,4 +1,4 @@
-"""The results of the tracking benchmark as one HTML page, with figures in the form of thesis Fig 5.9."""
+"""Write the results of the tracking benchmark as one HTML page, with figures like thesis Fig 5.9."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ Array = NDArray[np.float64]
 _WINDOWS: Final = 400  # of the drawing of margins
 _SECONDS: Final = 8.0  # [s] of each drawing
 _WORDS: Final = {
-    "NIS": "Normalised innovation squared: how far detections are from their prediction, relative to the uncertainty.",
-    "NEES": "Normalised estimation error squared: how far the estimate is from the truth, relative to its uncertainty.",
-    "Lag": "Delay with which the estimate follows the truth.",
-    "Window": "One prediction and the true motion that followed it.",
+    "NIS": "Normalised innovation squared: distance of a detection from its prediction, relative to the uncertainty.",
+    "NEES": "Normalised estimation error squared: error of the estimate, relative to its uncertainty.",
+    "Lag": "Delay of the estimated position behind the true position.",
+    "Window": "One prediction, and the true motion after the prediction.",
 }
 
 
@@ -42,7 +42,7 @@ def write_tracking_report(
     """Write the page and return its path.
 
     Args:
-        motions: recordings to draw.
+        motions: recorded motions to draw.
         tables: tables that the command also prints.
         path: the file to write; its folder must exist.
         sensor: the sensor.
@@ -58,7 +58,7 @@ def write_tracking_report(
 def tracking_report_html(
     motions: Sequence[RecordedMotion], tables: Sequence[Table], *, sensor: SensorModel, provenance: Mapping[str, Any]
 ) -> str:
-    """Return the whole page; see :func:`write_tracking_report`."""
+    """Return the whole page as HTML; for the arguments, see :func:`write_tracking_report`."""
     figures, tiles, nearer = [], [], []
     for motion in motions:
         tracking = follow(motion, ObstacleTracker(), sensor, (0.5, 1.0))
@@ -71,23 +71,23 @@ def tracking_report_html(
                 Figure(
                     position_chart(log, name),
                     f"Fig 5.9: position of the {name}",
-                    "(a) detections and estimate; (b) detections, estimate and true position, on the axis range of "
-                    "the detections.",
+                    "(a) Detections and estimate. (b) Detections, estimate and true position.",
                 )
             )
     figures.append(
         Figure(
             margin_chart(synthetic_windows(_WINDOWS, 0, sensor), synthetic_windows(_WINDOWS, 1, sensor)),
             "Errors of predictions and their margin",
-            f"Errors of {_WINDOWS} synthetic windows, and the margin calibrated with {_WINDOWS} others. Dashed: 95 % "
-            "of the errors at each look-ahead time alone; the margin must cover whole windows, so it is larger than "
-            "the dashed line.",
+            f"Errors of {_WINDOWS} synthetic windows, and the margin that was calibrated with {_WINDOWS} other "
+            "windows. Dashed line: at each look-ahead time, 95 % of the errors are below this line. The margin is "
+            "larger, because it must cover 95 % of the whole windows.",
         )
     )
     verdict = (
-        f"the estimate is nearer to the truth than the last detection for {sum(nearer)} of {len(nearer)} obstacles"
+        f"for {sum(nearer)} of {len(nearer)} obstacles, the estimate is nearer to the true position than the last "
+        "detection is"
     )
-    text = "The motions are real. Noise, latency and dropouts of the camera are simulated."
+    text = "The motions of the obstacles are recorded. Noise, latency and dropouts of the camera are simulated."
     return render(
         "avoidance.html",
         Header("Tracking of moving obstacles", verdict, bool(nearer) and all(nearer), text, tiles),
@@ -107,7 +107,7 @@ def _rms_mm(log: TrackLog, values: Any) -> float:
 
 
 def position_chart(log: TrackLog, name: str) -> str:
-    """Draw detections, estimate and truth over time, one below the other as in Fig 5.9 (a) and (b)."""
+    """Draw thesis Fig 5.9 (a) and (b), one below the other: detections, estimate and true position over time."""
     with canvas(f"position-{name}", f"Detected, estimated and true position of the {name} over time", (5.5, 4.4)) as c:
         upper, lower = c.axes(0.74, 2.65, 5.4, 4.2), c.axes(0.74, 0.72, 5.4, 2.15)
         draw_positions(upper, lower, log, truth=INK)
@@ -116,7 +116,7 @@ def position_chart(log: TrackLog, name: str) -> str:
 
 
 def margin_chart(calibration: Array, test: Array) -> str:
-    """Draw prediction errors (n, n_times) [m] over the look-ahead time, and the margin of other windows."""
+    """Draw the errors of the windows ``test`` over the look-ahead time, and the margin from ``calibration``."""
     margin = CoverageMargin.calibrate(calibration, COVERAGE, times=TIMES)
     with canvas("margin", "Errors of predictions over the look-ahead time, and their margin", (5.5, 2.6)) as c:
         axes = c.axes(0.74, 0.78, 5.4, 2.5)
@@ -134,13 +134,13 @@ def margin_chart(calibration: Array, test: Array) -> str:
 
 
 def draw_positions(upper: Any, lower: Any, log: TrackLog, *, truth: str = "black") -> None:
-    """Draw Fig 5.9 (a) and (b) on two matplotlib axes, along the axis with the largest motion.
+    """Draw thesis Fig 5.9 (a) and (b) on two matplotlib axes. Only the coordinate with the largest motion is drawn.
 
     Args:
-        upper: axes of (a): detections and estimate.
-        lower: axes of (b): detections, estimate and true position.
-        log: the log of one obstacle.
-        truth: colour of the true position.
+        upper: matplotlib axes for (a), which shows detections and estimate.
+        lower: matplotlib axes for (b), which shows detections, estimate and true position.
+        log: the true and the estimated motion of one obstacle.
+        truth: colour of the line for the true position.
     """
     shown = log.settled & (log.times < log.times[log.settled][0] + _SECONDS)
     axis = int(np.ptp(log.truth[shown], axis=0).argmax())

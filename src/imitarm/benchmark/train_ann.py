@@ -1,9 +1,11 @@
 """Train the network of the policy ``dmp-ann`` on paths of the expert: ``python -m imitarm.benchmark.train_ann``.
 
-The training scenes have the seeds that are reserved for training. Each has one obstacle of any shape on the path of one
-of four skills. In the first round, the network learns from the states along the expert's own paths. Each further round
-adds the states that the network's own motions visit (DAgger). For such a motion, the network learns the coupling term
-of the expert's path that is nearest to the motion.
+The expert is an optimiser that finds good paths around an obstacle. The network learns the coupling term, which is
+added to the equation of a movement primitive so that the motion follows such a path. Each training scene has one
+obstacle on the path of one of four skills, and a seed that is reserved for training. In the first round, the network
+learns from the states along the expert's paths. Each further round adds the states that the motions of the network
+visit (DAgger). For these states, the network learns the coupling term of the expert's path that is nearest to its
+motion.
 """
 
 from __future__ import annotations
@@ -57,11 +59,11 @@ class TrainingScene(NamedTuple):
     """One scene with the expert's paths.
 
     Attributes:
-        policy: policy with the skill, the tool and the forbidden directions of the scene.
-        scene: the scene with its one obstacle.
+        policy: policy ``dmp-ann`` with the skill, the tool and the forbidden directions of the scene.
+        scene: the scene with one obstacle.
         nominal: the learned path, with 200 samples.
-        deviations: for each expert path, a spline that gives its deviation from the learned path [m] as a function of
-            the elapsed fraction of the duration. The paths pass the obstacle on different sides; the best is first.
+        deviations: deviation of each path of the expert from the learned path. The paths pass the obstacle on different
+            sides. The best path is the first.
     """
 
     policy: DMPANN
@@ -71,10 +73,12 @@ class TrainingScene(NamedTuple):
 
 
 class Deviation:
-    """The deviation of an expert's path from the nominal path, as a spline.
+    """The deviation of the expert's path from the learned path.
+
+    It is a spline over the elapsed fraction of the duration.
 
     Args:
-        nominal: the nominal path.
+        nominal: the learned path.
         path: the expert's path at 100 equally spaced times, shape (100, 3) [m].
     """
 
@@ -83,27 +87,27 @@ class Deviation:
         self._spline = make_interp_spline(u, path - nominal.at(nominal.times[0] + u * nominal.duration)[0], k=5)
 
     def at(self, fraction: float) -> Array:
-        """Return the deviation at a fraction of the duration, shape (3,) [m]."""
+        """Return the deviation e at a fraction of the duration, shape (3,) [m]."""
         return np.asarray(self._spline(min(fraction, 1.0)))
 
     def velocity(self, fraction: float) -> Array:
-        """Return the derivative with respect to the fraction, shape (3,) [m]."""
+        """Return the derivative of e with respect to the fraction, shape (3,) [m]."""
         return np.asarray(self._spline(min(fraction, 1.0), 1))
 
     def term(self, fraction: float, stiffness: float, damping: float) -> Array:
-        """Return the coupling term ``K e + D e' + e''`` that makes a primitive follow the path, shape (3,) [m]."""
+        """Return the coupling term ``K e + D e' + e''`` that makes a movement primitive follow the path, (3,) [m]."""
         e, velocity, acceleration = (self._spline(min(fraction, 1.0), order) for order in range(3))
         return np.asarray(stiffness * e + damping * velocity + acceleration)
 
 
 class Samples(NamedTuple):
-    """Training samples. In each sample, a linear map takes the output of the network to a coupling term.
+    """Training samples. In each sample, a matrix converts the output of the network to a coupling term.
 
     Attributes:
         features: inputs of the network, shape (n, 10).
-        maps: linear map from the network's output to the coupling term, shape (n, 3, 3); the map removes the forbidden
-            directions.
-        terms: coupling terms C of the expert, shape (n, 3) [m].
+        maps: matrices that convert the output of the network to a coupling term, shape (n, 3, 3). They remove
+            components in forbidden directions.
+        terms: coupling terms of the expert, which the network should reproduce, shape (n, 3) [m].
     """
 
     features: Array
@@ -111,16 +115,19 @@ class Samples(NamedTuple):
     terms: Array
 
     def and_more(self, other: Samples) -> Samples:
-        """Return both sets of samples together."""
+        """Return these samples and ``other`` as one set."""
         return Samples(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
 
     def loss(self, network: MLP) -> float:
-        """Return the sum of squared errors divided by the sum of squared terms; 1 for a network that returns 0."""
+        """Return the sum of squared errors divided by the sum of squared terms.
+
+        It is 1 for a network that always returns 0.
+        """
         error = np.einsum("nde,ne->nd", self.maps, network(self.features)) - self.terms
         return float(np.sum(error**2) / np.sum(self.terms**2))
 
     def gradient(self, network: MLP, batch: NDArray[np.intp]) -> list[Array]:
-        """Return the derivatives of the mean loss of a batch."""
+        """Return the derivatives of the mean loss of the samples ``batch`` with respect to the weights."""
         maps, terms = self.maps[batch], self.terms[batch]
         scale = 2.0 / (len(batch) * float(np.mean(np.sum(self.terms**2, axis=1))))
 
@@ -141,8 +148,8 @@ def training_scene(number: int, network: MLP, split: str = "train") -> TrainingS
     """Return one scene; None if the expert finds no path.
 
     Args:
-        number: number of the scene; consecutive scenes use the skills in turn.
-        network: network of the policy.
+        number: number of the scene. Successive scenes use the four skills in turn.
+        network: network for the policy of the scene.
         split: name in :data:`~imitarm.benchmark.static_scenes.SPLITS`.
     """
     family, dimension = SKILLS[number % len(SKILLS)]
@@ -165,10 +172,11 @@ def _positions(path: Trajectory) -> tuple[Array, Array]:
 
 
 def samples_of(scene: TrainingScene, states: Iterable[MotionState], deviation: Deviation) -> Samples:
-    """Return one sample for each state of a motion, with the term of a path of the expert at the same time.
+    """Return one training sample for each state of a motion.
 
-    A state beside the path gets the same term as a state on it, because the spring of the motion primitive already
-    pulls the motion to the path.
+    The coupling term of a sample is that of the expert's path ``deviation`` at the same fraction of the duration. It
+    does not depend on the distance of the state from this path, because the spring of the primitive already pulls the
+    motion to the path.
     """
     stiffness, damping = scene.policy.skill.dmp_.gains_
     rows = []
@@ -213,7 +221,7 @@ class _Recorder(DMPANN):
 
 
 def visited_samples(scene: TrainingScene, network: MLP) -> Samples:
-    """Return the samples for the states that the network's own motion visits."""
+    """Return the samples for the states that the motion of the network visits."""
     recorder = _policy_of(scene, _Recorder, network)
     with contextlib.suppress(InfeasibleError):  # the states of a motion that does not arrive are samples too
         recorder.tool_path(scene.nominal, ToolGaps(scene.scene, scene.policy.tool_spheres), scene.scene)
@@ -227,10 +235,10 @@ class Training(NamedTuple):
 
     Attributes:
         network: the trained network.
-        losses: loss on the expert's states in the training scenes; the first value is before the training, and each
-            further value is after a round.
-        validation_loss: loss on the expert's states of the validation scenes.
-        kept: fraction of the validation scenes in which the motion keeps the clearance, for each of ``GAINS``.
+        losses: loss at the states along the expert's paths in the training scenes. The first value is the loss before
+            the training. Each further value is the loss after a round.
+        validation_loss: loss at the states along the expert's paths in the validation scenes.
+        kept: fraction of the validation scenes in which the motion keeps the clearance, for each gain in ``GAINS``.
         seconds: duration of the training, without the validation [s].
     """
 
@@ -242,7 +250,10 @@ class Training(NamedTuple):
 
     @property
     def gain(self) -> float:
-        """The gain that keeps the clearance in most validation scenes; among equally good gains, the smallest."""
+        """The gain with which the motion keeps the clearance in most validation scenes.
+
+        If several gains are equally good, this is the smallest.
+        """
         return GAINS[int(np.argmax(self.kept))]
 
 
@@ -253,7 +264,7 @@ def validation_samples(n_scenes: int) -> Samples:
 
 
 def fraction_kept(scenes: Sequence[TrainingScene], network: MLP, gain: float) -> float:
-    """Return the fraction of scenes in which the motion keeps the clearance at all samples and arrives."""
+    """Return the fraction of scenes in which the motion arrives and keeps the clearance at all samples."""
     kept = 0
     for scene in scenes:
         policy, gaps = _policy_of(scene, DMPANN, network, gain), ToolGaps(scene.scene, scene.policy.tool_spheres)
@@ -292,11 +303,11 @@ def train_network(
     """Train a network.
 
     Args:
-        seed: seed of the first weights and of the batches.
+        seed: seed of the initial weights and of the batches.
         n_scenes: number of training scenes.
         n_validation: number of validation scenes.
-        rounds: number of rounds in which the network's own motions add samples.
-        steps: steps of Adam in each round.
+        rounds: number of rounds after the first. In each of them, the motions of the network add samples.
+        steps: number of steps of the optimiser Adam in each round.
     """
     begun = time.perf_counter()
     rng = np.random.default_rng([52, seed])

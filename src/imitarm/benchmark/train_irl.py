@@ -1,26 +1,26 @@
 r"""Learn the weights of the baseline ``gmm-irl``: ``python -m imitarm.benchmark.train_irl --output weights.json``.
 
 The demonstrations are the best paths of the expert (:mod:`imitarm.policies.baselines.expert`) around one obstacle. Half
-of the scenes are planar, half are spatial, and all have seeds that are reserved for training. The result depends only
-on the arguments of the command.
+of the scenes are planar, and half are spatial. All scenes have seeds that are reserved for training. The same arguments
+of the command always give the same weights.
 
 Inverse reinforcement learning finds the weights of the path cost under which the demonstrated paths are most likely.
-The maximum-entropy model gives a path ``X`` the probability ``p(X) = exp(-J_w(X)) / Z_w`` (Ziebart et al. 2008). The
-integral ``Z_w`` is replaced by Laplace's approximation at the local minimum ``X*`` that belongs to the demonstration
-``X_d`` (Levine and Koltun 2012 use the same approximation at ``X_d``). Up to a constant, the log-likelihood of the
-weights ``w`` is::
+In the maximum-entropy model, a path ``X`` with the cost ``J_w(X)`` has the probability ``p(X) = exp(-J_w(X)) / Z_w``
+(Ziebart et al. 2008). Laplace's approximation replaces the integral ``Z_w``. We apply it at ``X*``, the local minimum
+of the cost that a search from the demonstration ``X_d`` finds. (Levine and Koltun 2012 apply it at ``X_d``.) Up to a
+constant, the log-likelihood of the weights ``w`` is::
 
     L(w) = sum_d [J_w(X*) - J_w(X_d) + 1/2 log det H_w(X*)],     H_w = Hessian of J_w
 
-Its derivative is the difference between expected and demonstrated features. With ``H_k`` for the Hessian of feature
+The derivative of ``L`` is the difference between expected and demonstrated features. ``H_k`` is the Hessian of feature
 ``phi_k``::
 
     dL/dw_k = sum_d [E phi_k - phi_k(X_d)],     E phi_k = phi_k(X*) + 1/2 tr(H_w^-1 H_k)
 
-The weights stay positive, because their logarithms are learned. The method is Fisher scoring, which uses the covariance
-of the features as the second derivative of ``L``: ``Cov(phi_k, phi_l) = grad phi_k^T H^-1 grad phi_l + 1/2 tr(H^-1 H_k
-H^-1 H_l)``. A normal prior on the logarithms keeps every weight finite, even a weight on which the demonstrations have
-no influence.
+We learn the logarithms of the weights, so the weights stay positive. The method is Fisher scoring: the covariance of
+the features approximates the second derivative of ``L``, with ``Cov(phi_k, phi_l) = grad phi_k^T H^-1 grad phi_l + 1/2
+tr(H^-1 H_k H^-1 H_l)``. A normal prior on the logarithms keeps every weight finite, even if the demonstrations do not
+determine this weight.
 """
 
 from __future__ import annotations
@@ -57,11 +57,12 @@ _SHIFTS = (0.0, *np.logspace(-10, 0, 11))  # of an indefinite Hessian, relative 
 
 
 class Expectation(NamedTuple):
-    """Mean and covariance of the path's features in one scene, under the maximum-entropy model.
+    """Mean and covariance of the features of a path in one scene, according to the maximum-entropy model.
 
     Attributes:
-        minimum: deviation from the learned path at which the cost has a local minimum, shape (94, k) [m].
-        mean: expected features, shape (m,).
+        minimum: deviation from the learned path at which the cost has a local minimum, shape (94, k) [m]. There are 94
+            free samples of the path and k permitted directions.
+        mean: expected value of each of the m features, shape (m,).
         covariance: covariance of the features, shape (m, m).
     """
 
@@ -74,10 +75,10 @@ class Learned(NamedTuple):
     """The result of learning.
 
     Attributes:
-        weights: w, shape (m,).
+        weights: learned weights w of the m features, shape (m,).
         demonstrated: mean features of the demonstrations, shape (m,).
-        expected: mean expected features under the weights, shape (m,).
-        n_iterations: number of iterations.
+        expected: mean expected features with the learned weights, shape (m,).
+        n_iterations: number of iterations that were needed.
     """
 
     weights: Array
@@ -87,7 +88,10 @@ class Learned(NamedTuple):
 
 
 def inverse_hessian(cost: PathCost, weights: Array, blocks: Array) -> Array:
-    """Return the inverse of the Hessian of J, shape (94 k, 94 k); an indefinite Hessian is made positive definite."""
+    """Return the inverse of the Hessian of the cost, shape (94 k, 94 k).
+
+    An indefinite Hessian is made positive definite first.
+    """
     band = cost.hessian(weights, blocks)
     for shift in _SHIFTS:
         shifted = band.copy()
@@ -97,11 +101,11 @@ def inverse_hessian(cost: PathCost, weights: Array, blocks: Array) -> Array:
         except LinAlgError:
             continue
         return np.asarray(cho_solve_banded((factor, False), np.eye(band.shape[1])))
-    raise InputError("the Hessian of the path cost is not finite")
+    raise InputError("train_irl: the Hessian of the path cost is not finite; check the learned path and the obstacle")
 
 
 def expectation(cost: PathCost, weights: Array, start: Array) -> Expectation:
-    """Search for a minimum of the cost from ``start`` (94, k); return Laplace's mean and covariance of the features."""
+    """Search for a minimum of the cost from ``start``, shape (94, k); return the expected features there."""
     minimum = cost.minimised(weights, start)
     blocks = cost.blocks(minimum)
     inverse = inverse_hessian(cost, weights, blocks)
@@ -129,7 +133,10 @@ def _times_smoothness(matrix: Array, smoothness: Array, k: int) -> Array:
 
 
 def first_weights(costs: Sequence[PathCost], demonstrated: Array) -> Array:
-    """Return weights that make all features' costs equal; their sum is half the number of free coordinates."""
+    """Return initial weights, with which all features contribute equally to the cost of the demonstrations.
+
+    The cost is then half the number of free coordinates.
+    """
     freedom = np.mean([cost.precisions.shape[0] * cost.precisions.shape[1] for cost in costs])
     part = 0.5 * float(freedom) / len(FEATURES)
     return np.asarray(part / np.where(demonstrated > 1e-6, demonstrated, part))
@@ -143,15 +150,15 @@ def learn_weights(
     iterations: int = 40,
     on_iteration: Callable[[int, Array], None] | None = None,
 ) -> Learned:
-    """Learn the weights of the features.
+    """Learn the weights of the features from demonstrations.
 
     Args:
-        costs: path cost of the scene of each demonstration.
-        demonstrations: deviation of each demonstration from the learned path, each of shape (94, k) [m].
-        prior: standard deviation of the normal prior on the logarithm of each weight; its mean is the logarithm of the
-            first weight.
+        costs: for each demonstration, the path cost of its scene.
+        demonstrations: for each demonstration, its deviation from the learned path, shape (94, k) [m].
+        prior: standard deviation of the normal prior on the logarithm of each weight. The mean of the prior is the
+            logarithm of the initial weight.
         iterations: largest number of iterations.
-        on_iteration: function called with the number of the iteration and the weights.
+        on_iteration: function that is called after each iteration, with its number and the weights.
     """
     shown = np.mean([cost.features(d) for cost, d in zip(costs, demonstrations, strict=True)], axis=0)
     first = np.log(first_weights(costs, shown))
@@ -176,11 +183,11 @@ def learn_weights(
 
 
 def demonstrations(n_scenes: int, first_seed: int = 0) -> Iterator[tuple[PathCost, Array]]:
-    """Yield the path cost of each training scene, and the expert's deviation from the learned path.
+    """Yield the path cost of each training scene, and the deviation of the expert's best path from the learned path.
 
     Args:
-        n_scenes: number of scenes; every second scene is planar.
-        first_seed: seed of the first two scenes.
+        n_scenes: number of scenes. Every second scene is planar.
+        first_seed: seed of the first two scenes (one planar, one spatial).
     """
     skills = {planar: learn(planar=planar) for planar in (True, False)}
     for i in range(n_scenes):
@@ -196,7 +203,7 @@ def demonstrations(n_scenes: int, first_seed: int = 0) -> Iterator[tuple[PathCos
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Learn the weights and write them with their origin."""
+    """Learn the weights, and write them to a file together with the command and the version of the code."""
     parser = argparse.ArgumentParser(prog="python -m imitarm.benchmark.train_irl", description=__doc__.split("\n\n")[0])
     parser.add_argument("--scenes", type=int, default=200, help="number of training scenes (default: 200)")
     parser.add_argument("--first-seed", type=int, default=0, help="seed of the first scene (default: 0)")

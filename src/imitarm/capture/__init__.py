@@ -1,4 +1,4 @@
-"""Capture: skeletons of a person, and the sources that deliver them.
+"""Capture of a person: skeletons, and the sources that deliver skeletons.
 
 ``SOURCES`` lists all sources by name. To add a source, write one class, and register the class in ``SOURCES`` or by an
 entry point of another package (group ``imitarm.sources``). The source then appears in the ``--help`` of every command
@@ -21,7 +21,7 @@ SOURCES: Registry[type[SkeletonSource]] = Registry(
         "azure": "imitarm.capture.kinect:AzureKinectSource",
     },
 )
-"""All sources by name. A user selects a source by ``NAME`` or ``NAME:ARGUMENT``; to select a file, the name of the file
+"""All sources by name. A user selects a source by ``NAME`` or ``NAME:ARGUMENT``. To select a file, the name of the file
 is enough."""
 
 __all__ = ["SOURCES", "Arm", "HandState", "Skeleton", "SkeletonSource", "Tracking"]
