@@ -1,4 +1,4 @@
-"""SkeletonCamera: a simulated skeleton camera with noise, bias, jitter, dropouts and occlusion, all from one seed."""
+"""SkeletonCamera: a simulated skeleton camera with the errors of a real camera. One seed determines all errors."""
 
 from __future__ import annotations
 
@@ -79,44 +79,44 @@ _SHAPE = (len(JOINTS), 3)
 class SkeletonCamera:
     r"""A simulated skeleton camera with the errors of a real camera.
 
-    The page docs/capture.md describes how the errors of real cameras were measured. A camera *tracks* each joint,
-    *infers* its position from other joints, or has *lost* it.
+    docs/capture.md describes how we measured the errors of real cameras. In each frame, the camera marks every joint as
+    *tracked* (seen), as *inferred* (estimated from other joints), or as *lost*.
 
-    A joint at position x is measured at :math:`x + b + M c + n`. The slow error ``c`` has standard deviation ``sigma``
-    on each axis across the line of sight, and ``1.4 sigma`` along the line of sight. For finger tips and thumbs, the
-    standard deviations of the slow error are 1.5 times as large. The slow error is a random process with a Matern
-    covariance of order 3/2. The variable u of this process increases with the time t and with the length :math:`|dx|`
-    of the joint's path,
+    The measured position of a joint at position x is :math:`x + b + M c + n`, with three errors: a bias b, a slow error
+    c, and a white noise n. The standard deviation of the slow error is ``sigma`` across the line of sight, and ``1.4
+    sigma`` along the line of sight. For finger tips and thumbs, it is 1.5 times as large. The slow error is a random
+    process with a Matern covariance of order 3/2. Its variable u increases with the time t and with the length of the
+    joint's path x:
 
     .. math:: du = dt / 5\,\mathrm{s} + |dx| / 8\,\mathrm{cm}, \qquad
               \mathrm{E}\,[c(0)\,c(u)] = \sigma^2 (1 + u)\,e^{-u},
 
-    Recordings of a Kinect v2 are the reason why the slow error depends on the path. In these recordings, the measured
-    length of a bone hardly changes while the arm is at rest, but changes by 1 to 2 cm while a joint moves by 10 to 20
-    cm. The matrix ``M`` correlates the errors of neighbouring joints, so that the length of the forearm varies less
-    than the length of the upper arm. The white noise ``n`` grows with the joint's speed. For elbow and wrist and a
-    ``sigma`` of 12 mm, the standard deviation of ``n`` is 0.2 mm at rest, and increases by 5 mm for each m/s of speed.
-    The bias ``b`` is a constant error of the elbow's depth.
+    The slow error depends on the path, because we observed this in recordings of a Kinect v2. In these recordings, the
+    measured length of a bone hardly changes while the arm is at rest. It changes by 1 to 2 cm when a joint moves by 10
+    to 20 cm. The matrix ``M`` correlates the errors of neighbouring joints. As a result, the measured length of the
+    forearm varies less than that of the upper arm. The white noise ``n`` grows with the speed of the joint. With a
+    ``sigma`` of 12 mm, the standard deviation of ``n`` for elbow and wrist is 0.2 mm at rest, and 5 mm more for each
+    m/s of speed. The bias ``b`` is a constant error of the elbow's depth.
 
     * Timing: on average, ``rate`` frames arrive per second, and the time between frames varies by ``jitter``. 3 % of
       the intervals between frames are twice the usual length, and 1 % of the frames show nobody.
     * Dropouts: for each arm, a dropout begins ``dropout`` times per second on average and lasts 2 to 20 frames. During
-      a dropout, the arm is inferred with three times its usual error, or the arm is lost, or the whole person is lost.
-    * Occlusion: the joints of a forearm are inferred while the forearm is behind the torso. An elbow is inferred while
-      it is behind the hand of the same arm.
-    * Hand states: occasionally, the state of a hand is wrong for one or two frames.
+      a dropout, the camera infers the arm with three times the usual error, loses the arm, or loses the whole person.
+    * Occlusion: the camera infers the joints of an arm that are behind the torso. It infers an elbow that is behind the
+      hand of the same arm.
+    * Hand states: occasionally, the camera reports a wrong state of a hand (open or closed) for one or two frames.
 
     Args:
         seed: number that determines all random values of the camera.
-        sigma: standard deviation of the slow error [m].
+        sigma: standard deviation of the slow error across the line of sight [m].
         rate: frames per second [Hz].
         jitter: standard deviation of the time between frames [s].
-        dropout: mean number of dropouts of each arm per second [Hz].
-        occlusion: whether joints that are hidden behind the body are inferred; otherwise, they are tracked.
-        elbow_bias: largest magnitude of the elbow's depth bias [m]; the actual bias is drawn uniformly between minus
+        dropout: mean number of dropouts per second for each arm [Hz].
+        occlusion: True: hidden joints are inferred. False: they are tracked as if they were visible.
+        elbow_bias: largest magnitude of the bias of the elbow's depth [m]. The bias is random, uniform between minus
             and plus this value.
-        faultless: whether to omit dropouts, occlusions, jitter and wrong hand states; with ``sigma=0`` and
-            ``elbow_bias=0``, the camera then reports the true positions.
+        faultless: whether to omit dropouts, occlusions, jitter and wrong hand states. With ``sigma=0`` and
+            ``elbow_bias=0``, a faultless camera reports the true positions.
 
     Raises:
         InputError: when a value is out of range.
@@ -155,7 +155,7 @@ class SkeletonCamera:
 
     @classmethod
     def from_seed(cls, seed: int, *, rate: float = 30.0) -> SkeletonCamera:
-        """Return a camera with a random ``sigma`` between 1 and 2 cm, and with default values for the other errors."""
+        """Return a camera with a random ``sigma`` between 1 and 2 cm; all other errors have their default sizes."""
         return cls(seed, sigma=float(np.random.default_rng([30314, seed]).uniform(0.01, 0.02)), rate=rate)
 
     @classmethod
@@ -176,7 +176,7 @@ class SkeletonCamera:
         """Return the skeleton that the camera reports, or None if the frame shows nobody.
 
         Args:
-            truth: the true skeleton, with a later time than the skeleton of the previous call.
+            truth: the true skeleton. Its time must be later than that of the previous call.
         """
         period = max(truth.time - self._time, 0.0) if math.isfinite(self._time) else 0.0
         error = self._error(truth.positions, period)

@@ -1,4 +1,4 @@
-"""Find faults in a recording of a person (``check``), and fix faults that need no guessing (``repaired``)."""
+"""Find faults in a recording of a person (``check``), and fix those faults that have only one remedy (``repaired``)."""
 
 from __future__ import annotations
 
@@ -53,11 +53,11 @@ _TRUNK = np.array([JOINT[name] for name in ("spine_base", "spine_mid", "spine_sh
 
 
 def check(recording: SkeletonRecording, side: str = "right") -> list[RecordingIssue]:
-    """Return all faults of a recording, errors first.
+    """Return all faults of a recording. Errors come before warnings and notes.
 
     Args:
-        recording: recording as read or captured.
-        side: which of the person's arms a robot is to follow, ``"left"`` or ``"right"``.
+        recording: recording from a file or a camera.
+        side: arm of the person that a robot should follow, ``"left"`` or ``"right"``.
 
     Raises:
         UnknownNameError: when ``side`` is neither left nor right.
@@ -74,15 +74,16 @@ def check(recording: SkeletonRecording, side: str = "right") -> list[RecordingIs
 
 
 def repaired(recording: SkeletonRecording) -> tuple[SkeletonRecording, list[str]]:
-    """Fix the faults that can be fixed without guessing, and report each change.
+    """Fix those faults of a recording that have only one remedy, and report each change.
 
-    If there are several persons, the one with the most frames is kept. A frame is dropped when it is not later than the
-    previous frame or repeats it exactly. Joints that jump away for a few frames (a spike) count as lost, and so do the
-    joints of an arm that is frozen while the body moves. If the camera swapped left and right from one frame to the
-    next, the swap is undone.
+    If there are several persons, only the person with the most frames is kept. A frame is dropped if it is not later
+    than the previous frame, or if it repeats the previous frame exactly. Two kinds of joints are marked as lost: joints
+    that jump away and back within a few frames (a spike), and the joints of an arm that does not move at all while the
+    body moves. If the camera swapped left and right from one frame to the next, the swap is undone.
 
     Returns:
-        The repaired recording, and one line of text for each kind of change; no lines if nothing was changed.
+        The repaired recording, and a list with one line of text for each kind of change. The list is empty if nothing
+        was changed.
     """
     notes: list[str] = []
     frames = recording.skeletons
@@ -188,11 +189,12 @@ class _View:
         fit = time_unit_that_fits(1.0 / self.period, self.time_unit)
         if fit is None:
             return (
-                "check the joints that jump, the frame rate from which the times were computed, and the unit of length"
+                "check three causes: joints that jump, a wrong frame rate in the computation of the times, or a wrong "
+                "unit of length"
             )
         name, factor = fit
         return (
-            f"the times were read in units of {time_unit_name(self.time_unit)}, but would be plausible in {name} "
+            f"the times were read in units of {time_unit_name(self.time_unit)}, but they seem to be in {name} "
             f"({1.0 / (factor * self.period):.1f} frames per second): multiply them by {factor:.10g}"
         )
 
@@ -213,10 +215,11 @@ def _people(recording: SkeletonRecording) -> Iterator[RecordingIssue]:
         yield RecordingIssue(
             "warning",
             "several-persons",
-            f"{len(recording.persons)} persons: {shown}; all other issues are about the person with the most frames",
+            f"the recording shows {len(recording.persons)} persons: {shown}; all other issues are about the person "
+            "with the most frames",
             second,
             recording.skeletons[second].time - recording.skeletons[0].time,
-            "choose one person by --person in a command, or by .person(number) in Python",
+            "choose one person: use --person NUMBER in a command, or .person(number) in Python",
         )
 
 
@@ -243,7 +246,7 @@ def _rate(view: _View) -> Iterator[RecordingIssue]:
         quick = speed > _QUICK_HAND
         message = f"{rate:.1f} frames per second are more than a skeleton camera delivers"
         if quick:
-            message = f"{message}; at this frame rate, the hands move at up to {speed:.1f} m/s"
+            message = f"{message}; at this frame rate, the hands would move at up to {speed:.1f} m/s"
         yield view.issue("error" if quick else "warning", "frame-rate", message, view.unit_remedy())
     elif rate < _LOW_RATE[1]:
         message = (
@@ -262,7 +265,10 @@ def _rate(view: _View) -> Iterator[RecordingIssue]:
 def _hand_speed(view: _View) -> Iterator[RecordingIssue]:
     speed = view.hand_speed
     if speed > FASTEST_HAND:
-        message = f"the hands move at {speed:.0f} m/s (90th percentile), faster than a person can move them"
+        message = (
+            f"according to the recording, the hands move at {speed:.0f} m/s (90th percentile), which is faster than a "
+            "person can move"
+        )
         yield view.issue("error", "hand-speed", message, view.unit_remedy())
 
 
@@ -271,7 +277,7 @@ def _axes(view: _View) -> Iterator[RecordingIssue]:
         fault, fit = view.other_axes
         remedy = "x must point to the sensor's left, y up, and z away from the sensor"
         if fit:
-            remedy += f"; if the person faces the sensor, use the axes {fit} of the file as x, y, z"
+            remedy += f"; if the person faces the sensor, use the file's axes {fit} as x, y, z"
         yield view.issue("error", "axes", fault, remedy)
 
 
@@ -282,8 +288,8 @@ def _gaps(view: _View) -> Iterator[RecordingIssue]:
         i = int(np.argmax(steps))
         stops = int((steps > _STOP).sum())
         message = (
-            f"{int(long.sum())} gaps between frames, the longest {steps[i]:.2f} s; "
-            f"{stops} of the gaps are longer than {_STOP:g} s, the time after which a robot stops"
+            f"{int(long.sum())} gaps between frames, the longest {steps[i]:.2f} s; in {stops} of these gaps, a robot "
+            f"would stop, because they are longer than {_STOP:g} s"
         )
         yield view.issue("warning", "gap", message, "cut the recording there with trim, or record again", i)
 
@@ -300,17 +306,17 @@ def _frozen(view: _View) -> Iterator[RecordingIssue]:
         ]
         if lasting:
             longest, first = max(lasting)
-            message = f"the positions of the {what} are exactly the same for {longest:.2f} s"
+            message = f"the positions of the {what} do not change at all for {longest:.2f} s"
             if len(lasting) > 1:
                 message = (
-                    f"in {len(lasting)} periods, the positions of the {what} are exactly the same; "
-                    f"the longest period lasts {longest:.2f} s"
+                    f"in {len(lasting)} periods, the positions of the {what} do not change at all; the longest period "
+                    f"lasts {longest:.2f} s"
                 )
-            remedy = "record again, because the sensor lost this joint while the other joints moved"
+            remedy = "record again: the sensor lost this joint while the other joints moved"
             if what not in joints:
                 remedy = (
-                    "repair the recording to drop these frames, which leaves a gap; record again if you need the "
-                    "motion in the gap"
+                    "repair the recording to drop these frames; if you need the motion in the gap that they leave, "
+                    "record again"
                 )
             yield view.issue("error" if longest > _STOP else "warning", "frozen", message, remedy, first)
             return
@@ -332,8 +338,8 @@ def _spikes(view: _View) -> Iterator[RecordingIssue]:
         frames = np.flatnonzero(spikes.any(axis=1))
         i, joint = divmod(int(np.argmax(size)), len(joints))
         message = (
-            f"spikes in {len(frames)} frame{'' if len(frames) == 1 else 's'}: joints jump away and "
-            f"back, by at most {size[i, joint]:.2f} m ({JOINTS[joints[joint]]})"
+            f"in {len(frames)} frame{'' if len(frames) == 1 else 's'}, joints jump away and back (a spike), by at "
+            f"most {size[i, joint]:.2f} m ({JOINTS[joints[joint]]})"
         )
         remedy = "repair the recording to mark these joints as lost in these frames"
         severity = _severity_of(joints, spikes)
@@ -351,9 +357,9 @@ def _jumps(view: _View) -> Iterator[RecordingIssue]:
         i, joint = divmod(int(np.argmax(size)), len(joints))
         count = int(jump.any(axis=1).sum())
         message = (
-            f"{count} jump{'' if count == 1 else 's'} after which the joint does not return; the largest is "
-            f"{size[i, joint]:.2f} m from one frame to the next "
-            f"({JOINTS[joints[joint]]}, {speed[i, joints[joint]]:.0f} m/s)"
+            f"{count} jump{'' if count == 1 else 's'} of a joint that does not return; the largest jump is "
+            f"{size[i, joint]:.2f} m from one frame to the next ({JOINTS[joints[joint]]}, "
+            f"{speed[i, joints[joint]]:.0f} m/s)"
         )
         remedy = "cut the recording there with trim, or record again"
         first = int(np.argmax(jump.any(axis=1))) + 1
@@ -384,7 +390,8 @@ def _arm(view: _View) -> Iterator[RecordingIssue]:
         yield view.issue("note", "arm-lost", message, "none needed", int(np.argmax(lost)))
     if inferred.mean() > _INFERRED:
         message = (
-            f"a joint of the {view.side} arm is inferred, not tracked, in {100 * inferred.mean():.0f} % of the frames"
+            f"in {100 * inferred.mean():.0f} % of the frames, the camera infers a joint of the {view.side} arm "
+            "instead of tracking it"
         )
         yield view.issue("warning", "arm-inferred", message, "keep the arm in view", int(np.argmax(inferred)))
 
@@ -393,8 +400,8 @@ def _hand(view: _View) -> Iterator[RecordingIssue]:
     lost = view.confidence[:, [2, 4, 5]].min(axis=1) < 1.0
     if lost.mean() > _HAND_LOST:
         message = (
-            f"wrist, hand tip and thumb are not all tracked in {100 * lost.mean():.0f} % of the frames; "
-            "in these frames, the tool will not rotate with the hand"
+            f"in {100 * lost.mean():.0f} % of the frames, the wrist, the hand tip or the thumb is not tracked; in "
+            "these frames, the tool will not rotate with the hand"
         )
         yield view.issue("note", "hand-lost", message, "use orientation 'fixed', or spread the thumb while recording")
 
@@ -411,14 +418,12 @@ def _limbs(view: _View) -> Iterator[RecordingIssue]:
         deviation = _MAD_TO_SIGMA * float(np.median(np.abs(seen - length)))
         if not _LIMB[0] <= length <= _LIMB[1]:
             unit = length_unit_that_fits(length)
-            remedy = (
-                "check the joints" if unit is None else f"the lengths are plausible in {unit}: convert the positions"
-            )
+            remedy = "check the joints" if unit is None else f"the positions seem to be in {unit}: convert them"
             message = f"the {name} is {length:.2f} m long"
             yield view.issue("error", "limb-length", message, f"positions must be in metres; {remedy}")
         elif deviation > _SPREAD * length and len(tracked) >= _FEW:
             spread = f"{100 * deviation / length:.0f} % around its median of {100 * length:.0f} cm"
-            message = f"the {name}'s length varies by {spread}"
+            message = f"the measured length of the {name} varies by {spread}"
             yield view.issue("warning", "limb-length", message, "record with more light, or face the sensor")
 
 

@@ -1,4 +1,4 @@
-"""Sources that filter another source: they select one person, undo swaps of left and right, or replay in real time."""
+"""Sources that filter another source: select one person, undo swaps of left and right, or replay in real time."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ _TORSO = np.array([JOINT[name] for name in ("spine_shoulder", "spine_mid", "neck
 class PersonFilter(SkeletonSource):
     """Selects one person from a source that may deliver several persons.
 
-    The filter follows the first person who appears, and ignores everybody else. The filter follows another person only
-    after the first person has been out of view for more than ``patience`` on the source's clock. By that time, every
-    retargeter (the part that turns a person's motion into a robot's motion) has stopped the robot. The retargeter
-    starts again with the new person. A camera that tracks only one person at a time may give two successive persons the
-    same number. The filter therefore also ignores a person who appears at a position that the followed person cannot
-    have reached by walking.
+    The filter follows the first person who appears, and ignores everybody else. It follows another person only after
+    the first person has been out of view for more than ``patience``. By that time, the retargeter (which converts the
+    person's motion to the robot's motion) has stopped the robot. It starts again with the new person. A camera that
+    tracks only one person at a time may give two successive persons the same number. Therefore the filter also ignores
+    a person at a position that the followed person cannot have reached by walking.
 
     Args:
         source: the source to filter.
-        person: the only person to follow, by the number that the source gives; None: the first person who is seen.
-        patience: time out of view after which another person may be followed [s].
+        person: number of the person to follow, as the source numbers persons; None: follow the first person who
+            appears.
+        patience: time after which another person may be followed, if the followed person is out of view [s].
 
     Attributes:
         followed: number of the followed person; None before a person is followed.
-        passed_over: number of ignored skeletons of other persons.
+        passed_over: number of skeletons of other persons that were ignored.
 
     Raises:
         InputError: when the patience is negative, or the source is not a SkeletonSource.
@@ -63,7 +63,7 @@ class PersonFilter(SkeletonSource):
         self._source.close()
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton of the followed person; None when none arrived within ``timeout`` seconds."""
+        """Return the next skeleton of the followed person; None if no skeleton arrived within ``timeout`` seconds."""
         until = clock.monotonic() + timeout
         while not self._source.over:
             skeleton = self._source.read(max(until - clock.monotonic(), 0.0))
@@ -151,31 +151,30 @@ _DECIDING = _pairs(("shoulder", "hip", "elbow", "wrist"))
 
 
 def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
-    r"""Return the skeleton with left and right assigned as in the previous frame.
+    r"""Return the skeleton with left and right as in the previous frame, even if the camera has swapped them.
 
-    If a camera swaps left and right, both sides appear to move far within one frame. Let :math:`l_j, r_j` be the
-    positions of the left and the right joint of pair j, and :math:`l'_j, r'_j` their positions in the previous frame, a
-    time t earlier. Swapping the two joints back shortens their apparent motion by
+    If a camera swaps left and right, both sides seem to move far within one frame. Pair j consists of a left and a
+    right joint, for example the two wrists. Let :math:`l_j, r_j` be their positions, and :math:`l'_j, r'_j` their
+    positions in the previous frame, a time t earlier. Swapping the two joints back shortens their motion by
 
     .. math:: g_j = |l_j - l'_j| + |r_j - r'_j| - |l_j - r'_j| - |r_j - l'_j|
 
-    The joints are swapped back if :math:`g_j` exceeds the threshold :math:`m(v) = \max(0.15, v t)` [m], where v is the
-    largest plausible speed of a joint (0.5 m/s for shoulders and hips, 4 m/s for the joints of an arm). There are three
-    conditions, which are tested in this order.
+    The threshold for this length is :math:`m(v) = \max(0.15, v t)` [m]. Here v is the largest plausible speed of a
+    joint: 0.5 m/s for shoulders and hips, 4 m/s for the joints of an arm. Three conditions are tested in this order:
 
     1. The whole body is swapped back if :math:`\sum_j g_j > \sum_j m(0.5)` over the pairs of shoulders and hips.
-    2. Elbows, wrists and hands are swapped back if :math:`g_j > m(4)` for the elbows and also for the wrists.
+    2. Elbows, wrists and hands are swapped back if :math:`g_j > m(4)` for the elbows and for the wrists.
     3. Otherwise, wrists and hands alone are swapped back if :math:`g_j > m(4)` for the wrists.
 
-    If condition 1 holds, the whole body is swapped back before conditions 2 and 3 are tested. A joint is used only if
-    it is visible now and both joints of its pair were visible in the previous frame. If only one joint of a pair is
-    used, :math:`g_j` contains only the terms of this joint, and the threshold of the pair is halved. If neither joint
-    of a pair can be used, condition 1 leaves the pair out. Condition 2 or 3 does not hold if it needs this pair.
-    Hands that touch are too close to each other to satisfy a condition, so they are not swapped.
+    If condition 1 holds, the whole body is swapped back before conditions 2 and 3 are tested. A joint can be used if it
+    is visible now and both joints of its pair were visible in the previous frame. If only one joint of a pair can be
+    used, :math:`g_j` contains only the terms of this joint, and the threshold is halved. If no joint of a pair can be
+    used, condition 1 leaves the pair out, and a condition 2 or 3 that needs the pair is false. Hands that touch each
+    other are too close to satisfy a condition, so they are never swapped.
 
     Args:
         skeleton: skeleton as the camera reports it.
-        before: previous frame, with left and right assigned correctly.
+        before: skeleton of the previous frame, in which left and right are correct.
 
     Returns:
         The corrected skeleton; the same object if left and right were not swapped.
@@ -184,7 +183,7 @@ def unswapped(skeleton: Skeleton, before: Skeleton) -> Skeleton:
 
 
 def _kept(skeleton: Skeleton, before: Array, period: float) -> Skeleton:
-    """Return the skeleton with left and right assigned as in ``before``.
+    """Return the skeleton with left and right as in ``before``.
 
     The positions ``before`` [m] were measured ``period`` seconds earlier than the skeleton.
     """
@@ -242,7 +241,7 @@ class SideMemory:
         self._seen = np.full(len(JOINTS), -np.inf)
 
     def update(self, skeleton: Skeleton) -> Skeleton:
-        """Return ``skeleton`` with left and right assigned as in the skeleton of the previous call."""
+        """Return ``skeleton`` with left and right as in the skeleton of the previous call."""
         right = skeleton
         period = abs(skeleton.time - self._time)
         if period <= MEMORY:
@@ -256,10 +255,11 @@ class SideMemory:
 
 
 class SideFilter(SkeletonSource):
-    """Undoes swaps of left and right in a source, separately for each person; see :func:`unswapped`.
+    """Undoes swaps of left and right in a source, for each person separately; see :func:`unswapped`.
 
-    The filter decides from the motion alone, and assumes that left and right are correct in the first frame. After half
-    a second without frames, the filter restarts; every retargeter has stopped by this time.
+    The filter compares successive frames, and assumes that left and right are correct in the first frame. After half a
+    second without frames, it assumes this again for the next frame. By this time, every retargeter has stopped the
+    robot.
 
     Args:
         source: a source that may swap left and right.
@@ -285,7 +285,7 @@ class SideFilter(SkeletonSource):
         self._source.close()
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton, with correct left and right; None when none arrived within ``timeout`` seconds."""
+        """Return the next skeleton, with swaps undone; None if no skeleton arrived within ``timeout`` seconds."""
         skeleton = self._source.read(timeout)
         if skeleton is None:
             return None
@@ -293,13 +293,13 @@ class SideFilter(SkeletonSource):
 
 
 class RealtimeSource(SkeletonSource):
-    """Delays the skeletons of a source so that they arrive in real time.
+    """Delays the skeletons of a source, so that they arrive at the pace of their time stamps.
 
-    The clock starts with the first call of :meth:`read`. Each skeleton is returned no earlier than its time stamp
-    relative to the first skeleton.
+    The first call of :meth:`read` returns the first skeleton at once. Each later skeleton is returned when as much time
+    has passed as its time stamp is later than that of the first skeleton.
 
     Args:
-        source: source that returns skeletons as fast as they are read.
+        source: source that returns skeletons without waiting, such as a recording.
     """
 
     def __init__(self, source: SkeletonSource) -> None:
@@ -318,7 +318,7 @@ class RealtimeSource(SkeletonSource):
         self._source.close()
 
     def read(self, timeout: float = 1.0) -> Skeleton | None:
-        """Return the next skeleton; None when none is due within ``timeout`` seconds."""
+        """Return the next skeleton; None if its time does not come within ``timeout`` seconds."""
         until = clock.monotonic() + timeout
         if self._waiting is None:
             self._waiting = self._source.read(timeout)

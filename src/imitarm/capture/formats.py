@@ -1,4 +1,4 @@
-"""Files of skeletons: imitarm's own text format, tables exported with the Kinect SDK, and motion capture of an arm."""
+"""Read and write files of skeletons: imitarm's text format, tables of the Kinect SDK, and motion capture of an arm."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ NAMES = (
     *(f"{joint}_{part}" for joint in JOINTS for part in ("x", "y", "z", "tracking")),
 )
 UNFINISHED = "not closed"
-"""Placeholder that stands for the number of frames in the header of a file that is still being written."""
+"""Text in the header of a file that is still being written. It stands in the place of the number of frames."""
 
 TICK = 1e-7  # [s] time unit of the Kinect SDK
 _KINECT_COLUMNS = 1 + 4 * len(JOINTS)
@@ -51,7 +51,7 @@ _UPPER_ARM = (0.1, 0.6)  # [m] of motion capture
 
 
 def is_native(head: bytes) -> bool:
-    """Return whether a file begins with ``# format: imitarm-skeletons``, as imitarm's own format does."""
+    """Return whether a file begins with ``# format: imitarm-skeletons``, the first line of imitarm's own format."""
     return _MARK.match(head.replace(b"\r\n", b"\n").replace(b"\r", b"\n")) is not None
 
 
@@ -59,16 +59,16 @@ def native_header(source: str, frames: str) -> str:
     """Return the header of imitarm's own format: the lines before the first skeleton.
 
     Args:
-        source: origin of the skeletons.
-        frames: number of frames, or :data:`UNFINISHED`; padded with spaces, so that a number can later overwrite the
-            text.
+        source: name of the source of the skeletons.
+        frames: number of frames, or :data:`UNFINISHED`. The header pads it with spaces, so that a number can later
+            overwrite the text.
     """
     remarks = {
         "format": FORMAT,
         "version": VERSION,
         "frames": f"{frames:<20}",
         "units": "m s",
-        "frame": "sensor: x to its left, y up, z away from it",
+        "frame": "axes of the sensor: x to the sensor's left, y up, z away from the sensor",
         "tracking": "0 lost, 1 inferred, 2 tracked",
         "hands": ", ".join(f"{state.value} {state.name.lower().replace('_', ' ')}" for state in HandState),
         "source": " ".join(source.split()),
@@ -78,7 +78,7 @@ def native_header(source: str, frames: str) -> str:
 
 
 def native_line(skeleton: Skeleton) -> str:
-    """Return a skeleton as one line of text, from which exactly the same numbers can be read back."""
+    """Return a skeleton as one line of text. Reading the line gives exactly the same numbers."""
     left, right = skeleton.hand_states
     fields = [repr(skeleton.time), str(skeleton.person), str(int(left)), str(int(right))]
     for (x, y, z), tracking in zip(skeleton.positions.tolist(), skeleton.tracking.tolist(), strict=True):
@@ -89,8 +89,8 @@ def native_line(skeleton: Skeleton) -> str:
 def read_native(path: str, content: bytes) -> tuple[list[Skeleton], list[RecordingIssue]]:
     """Read imitarm's own format.
 
-    A recording that was not closed, because its writer was killed or is still running, is read up to the last complete
-    line. An issue then reports that the recording was not closed.
+    The program that writes a recording may have been killed, or it may still be running. In this case, the recording is
+    read up to the last complete line, and an issue reports that the recording was not closed.
 
     Args:
         path: path of the file, for messages.
@@ -100,15 +100,15 @@ def read_native(path: str, content: bytes) -> tuple[list[Skeleton], list[Recordi
         The skeletons, and the issues found while reading.
 
     Raises:
-        FileFormatError: when a file that had been completed was cut off afterwards, the file has another format
-            version, or a line is not a skeleton; the message names file and line.
+        FileFormatError: when a complete file was cut off, the file has another format version, or a line is not a
+            skeleton. The message names file and line.
     """
     unfinished = _is_unfinished(content)
     torn = unfinished and not content.endswith(b"\n")
     if torn:
         content = content[: content.rfind(b"\n") + 1]
     if unfinished and content.rstrip().endswith(NAMES[-1].encode()):
-        raise FileFormatError(f"{path}: was not closed and holds no whole frame (no complete line); record it again")
+        raise FileFormatError(f"{path}: the recording was not closed and contains no complete frame; record again")
     table = parse_table(path, content)
     version = table.remarks.get("version", "")
     if version != str(VERSION):
@@ -117,22 +117,29 @@ def read_native(path: str, content: bytes) -> tuple[list[Skeleton], list[Recordi
         )
     if table.names != NAMES:
         raise FileFormatError(
-            f"{path}: the columns are not those of format version {VERSION}; record or convert the file again"
+            f"{path}: the columns differ from those of format version {VERSION}; record or convert the file again"
         )
     n = len(table.values)
     announced = table.remarks.get("frames", "")
     if not unfinished and announced != str(n):
         raise FileFormatError(
-            f"{path}, line {int(table.lines[-1])}: ends after {n} frames, but the header announces {announced}; "
-            "the file was cut off: copy it again, or correct the number after '# frames:'"
+            f"{path}, line {int(table.lines[-1])}: the file ends after {n} frames, but its header announces "
+            f"{announced}; copy the complete file again, or correct the number after '# frames:'"
         )
     issues = []
     if unfinished:
         lost = "; the frame that was being written is lost" if torn else ""
-        message = f"was not closed: its writer was stopped or is still running; {n} whole frames were read{lost}"
+        message = (
+            f"the recording was not closed, because the program that writes it was stopped or is still running; {n} "
+            f"complete frames were read{lost}"
+        )
         issues.append(
             RecordingIssue(
-                "note", "not-closed", message, n - 1, remedy="save the recording under another name to keep it"
+                "note",
+                "not-closed",
+                message,
+                n - 1,
+                remedy=("save the recording under another name to keep these frames"),
             )
         )
     persons = _persons(table, content)
@@ -161,7 +168,7 @@ def _persons(table: Table, content: bytes) -> list[int]:
 def read_kinect_table(path: str, content: bytes) -> tuple[list[Skeleton], list[RecordingIssue]]:
     """Read a Kinect SDK table of 101 columns: time [100 ns], then x, y, z [m] and state of 25 joints in SDK order.
 
-    The returned times are counted from the first frame. A table of this kind contains neither person numbers nor hand
+    The returned times begin with 0 at the first frame. A table of this kind does not contain person numbers or hand
     states. A comma at the end of a line is accepted.
 
     Args:
@@ -172,15 +179,15 @@ def read_kinect_table(path: str, content: bytes) -> tuple[list[Skeleton], list[R
         The skeletons, and the issues found while reading.
 
     Raises:
-        FileFormatError: when the file is not a Kinect SDK table, was cut off, or has a field that is not a number; the
+        FileFormatError: when the file is not a Kinect SDK table, was cut off, or has a field that is not a number. The
             message names file and line.
     """
     table = parse_table(path, content)
     n, columns = table.values.shape
     if columns != _KINECT_COLUMNS:
         raise FileFormatError(
-            f"{path}, line {int(table.lines[0])}: {columns} columns, so this is no recording of skeletons; export it "
-            "in imitarm's own format, which begins with '# format: imitarm-skeletons', or as a Kinect SDK table of "
+            f"{path}, line {int(table.lines[0])}: a recording of skeletons can't have {columns} columns; export it in "
+            "imitarm's own format, which begins with '# format: imitarm-skeletons', or as a Kinect SDK table of "
             f"{_KINECT_COLUMNS} columns (time, then x, y, z and state of 25 joints)"
         )
     times = (table.values[:, 0] - table.values[0, 0]) * TICK
@@ -188,10 +195,10 @@ def read_kinect_table(path: str, content: bytes) -> tuple[list[Skeleton], list[R
     period = abs(float(times[-1])) / max(n - 1, 1)
     if n > 1 and period < 1.0 / _FASTEST_RATE:
         fit = time_unit_that_fits(1.0 / period, TICK) if period > 0.0 else None
-        unit = "" if fit is None else f"the times are plausible in {fit[0]}: multiply them by {fit[1]:.10g}; "
+        unit = "" if fit is None else f"the times seem to be in {fit[0]}: multiply them by {fit[1]:.10g}; "
         raise FileFormatError(
-            f"{path}: {n} frames within {abs(float(times[-1])):.3g} s; the Kinect SDK writes times in units of 100 ns, "
-            f"but this file does not; {unit}if the times are in seconds, multiply them by 10 000 000"
+            f"{path}: {n} frames within {abs(float(times[-1])):.3g} s, if the times are in units of 100 ns, as in a "
+            f"table of the Kinect SDK; {unit}if the times are in seconds, multiply them by 10 000 000"
         )
     return skeletons, issues
 
@@ -217,7 +224,7 @@ def _skeletons(
     states = np.zeros((len(times), 2)) if hands is None else hands
     _refuse(table, ~np.isfinite(times), "the time is not a finite number")
     _refuse(table, ~np.isin(joints[..., 3], (0, 1, 2)).all(axis=1), "a tracking state is not 0, 1 or 2")
-    _refuse(table, ~np.isin(states, range(len(HandState))).all(axis=1), "a hand's state is not one of 0 to 4")
+    _refuse(table, ~np.isin(states, range(len(HandState))).all(axis=1), "the state of a hand is not 0, 1, 2, 3 or 4")
     skeletons = [
         Skeleton(time, frame[:, :3], frame[:, 3].astype(np.int8), (HandState(int(left)), HandState(int(right))), person)
         for time, frame, (left, right), person in zip(
@@ -245,14 +252,14 @@ def _far_joints(table: Table, times: Array, joints: Array) -> list[RecordingIssu
         f"{FARTHEST:.0f} m from the sensor; the first is {JOINTS[int(np.argmax(far[frame]))]} in line "
         f"{int(table.lines[frame])}; these joints count as lost"
     )
-    remedy = "check the unit of length and the sensor"
+    remedy = "check the unit of length (metres) and the sensor"
     if far.mean() > 0.5:
         with np.errstate(invalid="ignore", over="ignore"):
             lengths = [np.linalg.norm(joints[:, a, :3] - joints[:, b, :3], axis=1) for a, b in _LIMBS]
         finite = np.concatenate(lengths)[np.isfinite(np.concatenate(lengths))]
         unit = length_unit_that_fits(float(np.median(finite))) if len(finite) else None
         if unit is not None:
-            remedy = f"positions must be in metres; these positions are plausible in {unit}: convert them"
+            remedy = f"positions must be in metres, but these positions seem to be in {unit}: convert them"
     return [RecordingIssue("warning", "far-joint", message, frame, float(times[frame] - times[0]), remedy)]
 
 
@@ -260,16 +267,16 @@ def _far_joints(table: Table, times: Array, joints: Array) -> list[RecordingIssu
 
 
 def is_motion_capture(head: bytes) -> bool:
-    """Return whether a file begins like a tab-separated table of markers from QTM (Qualisys Track Manager)."""
+    """Return whether a file begins like a table of markers from QTM (Qualisys Track Manager), separated by tabs."""
     return head.startswith(b"NO_OF_FRAMES\t") and b"\nMARKER_NAMES\t" in head
 
 
 def read_motion_capture(path: str) -> tuple[list[Skeleton], list[RecordingIssue]]:
     """Read a motion capture of an arm with :meth:`MotionCapture.load`, and add a synthetic body to the arm.
 
-    The right arm is the captured arm with its measured bone lengths, and is marked as tracked. The rest of the body,
-    which was not captured, is that of an average person who stands upright in front of a sensor. This synthetic part of
-    the body is marked as inferred.
+    The captured arm becomes the right arm, with its measured bone lengths, and is marked as tracked. The rest of the
+    body is synthetic and is marked as inferred. It belongs to an average person who stands upright in front of a
+    sensor.
 
     Args:
         path: path of the file.
@@ -278,7 +285,7 @@ def read_motion_capture(path: str) -> tuple[list[Skeleton], list[RecordingIssue]
         The skeletons, and the issues found while reading.
 
     Raises:
-        FileFormatError: when the file is damaged or lacks a marker of the right arm; the message names the line.
+        FileFormatError: when the file is damaged or lacks a marker of the right arm. The message names the line.
     """
     captured = MotionCapture.load(path)
     truth = captured.truth(Person.from_seed(0))
@@ -292,11 +299,11 @@ def read_motion_capture(path: str) -> tuple[list[Skeleton], list[RecordingIssue]
 
 @dataclass(frozen=True, eq=False)
 class MotionCapture:
-    """A right arm recorded by optical motion capture, in axes x forward, y left, z up.
+    """The motion of a right arm that was recorded by optical motion capture. The axes are x forward, y left, z up.
 
     Attributes:
         times: time stamps, shape (n,) [s].
-        points: shoulder, elbow, wrist, hand tip, thumb, shape (n, 5, 3) [m].
+        points: positions of shoulder, elbow, wrist, hand tip and thumb, shape (n, 5, 3) [m].
         source: path of the file.
     """
 
@@ -308,23 +315,23 @@ class MotionCapture:
     def load(cls, path: str | Path, *, to_body: ArrayLike | None = None) -> MotionCapture:
         """Read markers of a right arm from a file of tab-separated values in millimetres.
 
-        The wrist is the midpoint of the markers ``hand_left`` and ``hand_right``. These two markers are on the hand, at
-        its end next to the forearm.
+        The wrist is the midpoint between the markers ``hand_left`` and ``hand_right``, which are on the hand near the
+        forearm.
 
         Args:
             path: path of the file.
-            to_body: rotation matrix, shape (3, 3), from the file's axes to the person's axes (x forward, y left, z up).
-                With None, the file already uses the person's axes.
+            to_body: rotation matrix, shape (3, 3), from the axes of the file to the axes of the person (x forward, y
+                left, z up); None: the file uses the axes of the person.
 
         Raises:
-            FileFormatError: when the file is not a motion capture of a right arm; the message names the fault and the
+            FileFormatError: when the file is not a motion capture of a right arm. The message names the fault and the
                 line.
             InputError: when ``to_body`` is not a rotation matrix.
         """
         rotation = np.eye(3) if to_body is None else np.array(to_body, dtype=float)
         orthonormal = rotation.shape == (3, 3) and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
         if not orthonormal or np.linalg.det(rotation) < 0.0:
-            raise InputError(f"MotionCapture: to_body must be a rotation of shape (3, 3), got {to_body!r}")
+            raise InputError(f"MotionCapture: to_body must be a rotation matrix of shape (3, 3), got {to_body!r}")
         path = Path(path)
         try:
             lines = path.read_text(encoding="utf-8").splitlines()
@@ -336,7 +343,8 @@ class MotionCapture:
         first = next((i for i, line in enumerate(lines) if line.startswith("Frame\tTime")), None)
         if header is None or first is None:
             raise FileFormatError(
-                f"{path}: has no lines that begin with MARKER_NAMES and Frame; give a motion capture export as .tsv"
+                f"{path}: a line that begins with MARKER_NAMES or a line that begins with Frame is missing; give a "
+                "motion capture export as .tsv"
             )
         names = lines[header].split("\t")[1:]
         missing = [name for name in _MARKERS if name not in names]
@@ -352,22 +360,23 @@ class MotionCapture:
         back = np.flatnonzero(np.diff(table[:, 0]) <= 0.0)
         if len(back):
             raise FileFormatError(
-                f"{path}, line {filled[back[0] + 1] + 1}: the time does not increase; sort the frames by time"
+                f"{path}, line {filled[back[0] + 1] + 1}: the time is not later than in the previous frame; sort the "
+                "frames by time"
             )
         s, e, left, right, tip, thumb = np.moveaxis(table[:, 1:].reshape(len(table), -1, 3) * 1e-3 @ rotation.T, 1, 0)
         upper = float(np.median(np.linalg.norm(e - s, axis=1)))
         if not _UPPER_ARM[0] < upper < _UPPER_ARM[1]:
             raise FileFormatError(
-                f"{path}: if the positions are in millimetres, the upper arm would be {upper:.3g} m long; export "
-                "positions in mm"
+                f"{path}: the upper arm would be {upper:.3g} m long if the positions were in millimetres; export the "
+                "positions in millimetres"
             )
         return cls(table[:, 0], np.stack([s, e, 0.5 * (left + right), tip, thumb], axis=1), path.name)
 
     def truth(self, person: Person) -> Truth:
-        """Return the motion as if ``person`` made it in front of a sensor, with the bone lengths of the captured arm.
+        """Return the motion as a sensor in front of ``person`` would see it, with the bone lengths of the captured arm.
 
         The arm is interpolated linearly between frames, and is at rest before the first and after the last frame. The
-        rest of the body stands upright at the person's position.
+        person stands upright.
         """
         to_sensor = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
         points = self.points @ to_sensor.T
@@ -397,8 +406,11 @@ def _row(path: Path, number: int, line: str, columns: list[int]) -> list[float]:
         values = [float(fields[1])] + [float(fields[c + k]) for c in columns for k in range(3)]
     except (ValueError, IndexError) as error:
         raise FileFormatError(
-            f"{path}, line {number}: not a frame of numbers ({error}); is the file complete?"
+            f"{path}, line {number}: a field of the frame is not a number or is missing ({error}); export the "
+            "complete recording again"
         ) from error
     if not np.isfinite(values).all():
-        raise FileFormatError(f"{path}, line {number}: a marker of the arm has a gap; fill the gap before exporting")
+        raise FileFormatError(
+            f"{path}, line {number}: the position of a marker of the arm is missing; fill the gap before exporting"
+        )
     return values
