@@ -208,7 +208,7 @@ def test_wrong_arguments_are_named():
         static_case("S0", 2, 0)
     with pytest.raises(InputError, match="dimension must be 2 or 3"):
         static_case("S1", 4, 0)
-    with pytest.raises(InputError, match="scenes of S4 are made for its own skill"):
+    with pytest.raises(InputError, match="scenes of S4 need the skill of this family"):
         static_case("S4", 2, 0, skill=learned_skill("S4", 2))
     short = Skill(4).fit(
         [

@@ -53,7 +53,7 @@ def test_a_lost_arm():
 def test_gaps():
     frames = skeletons(90)
     finding = found(frames[:30] + frames[45:])["gap"]
-    assert "the longest 0.53 s; 1 of the gaps are longer" in finding.message and finding.frame == 29
+    assert "the longest 0.53 s; in 1 of these gaps, a robot would stop" in finding.message and finding.frame == 29
     assert "gap" not in found(frames[:30] + frames[31:])  # one frame slipped is usual
 
 

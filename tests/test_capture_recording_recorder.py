@@ -77,7 +77,7 @@ def test_a_torn_last_line_is_left_out_and_said_wherever_it_was_torn(tmp_path):
         part.write_bytes(content[:n])
         recording = read_recording(part)
         assert len(recording) == 2
-        assert "2 whole frames were read; the frame that was being written is lost" in recording.issues[0].message
+        assert "2 complete frames were read; the frame that was being written is lost" in recording.issues[0].message
     part.write_bytes(content[: content.index(b"\nt,") + 40])
     with pytest.raises(FileFormatError, match=r"a\.csv\.part"):
         read_recording(part)
@@ -96,7 +96,7 @@ def test_no_frames_leave_no_file(tmp_path):
         pass
     assert list(tmp_path.iterdir()) == []
     part = SkeletonRecorder(tmp_path / "b.csv")
-    with pytest.raises(FileFormatError, match="holds no whole frame"):
+    with pytest.raises(FileFormatError, match="contains no complete frame"):
         read_recording(tmp_path / "b.csv.part")
     part.close()
 

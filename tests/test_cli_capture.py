@@ -200,7 +200,7 @@ def with_spikes(frames):
         (
             microseconds,
             "frame-rate",
-            "units of 100 ns, but would be plausible in us (30.0 frames per second): multiply them by 10",
+            "units of 100 ns, but they seem to be in us (30.0 frames per second): multiply them by 10",
         ),
         (z_up, "axes", "use the axes x, z, -y of the file as x, y, z"),
         (frozen, "frozen", "repaired: dropped 89 frames that repeat the previous frame, for up to 2.97 s at a time"),

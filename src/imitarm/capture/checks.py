@@ -277,7 +277,7 @@ def _axes(view: _View) -> Iterator[RecordingIssue]:
         fault, fit = view.other_axes
         remedy = "x must point to the sensor's left, y up, and z away from the sensor"
         if fit:
-            remedy += f"; if the person faces the sensor, use the file's axes {fit} as x, y, z"
+            remedy += f"; if the person faces the sensor, use the axes {fit} of the file as x, y, z"
         yield view.issue("error", "axes", fault, remedy)
 
 
