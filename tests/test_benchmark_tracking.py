@@ -128,7 +128,7 @@ def test_the_command_prints_and_fills_tables(tmp_path, capsys, monkeypatch, moti
     assert [row[1] for row in tables[0].rows][-1] == "constant-velocity"
     assert len(tables[1].rows) == 1
     html = tracking_report_html(motions[1:], tables, sensor=SENSOR, provenance={"code": "x"})
-    assert "nearer to the truth than the last detection for 1 of 1 obstacles" in html
+    assert "for 1 of 1 obstacles, the estimate is nearer to the true position" in html
     assert "Fig 5.9: position of the trolley" in html
     assert "margin of synthetic windows" in html
     assert "<svg" in html
