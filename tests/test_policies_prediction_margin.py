@@ -19,7 +19,7 @@ from imitarm.kinematics.arm_path import ArmPath
 from imitarm.perception import CoverageMargin
 from imitarm.policies import HORIZONTAL_ONLY
 from imitarm.policies.arm_certificate import ArmAmongObstacles
-from imitarm.policies.prediction_margin import PredictionMargin, margins_in
+from imitarm.policies.prediction_margin import EstimatedMargin, PredictionMargin, margins_in
 from imitarm.robots import SimulatedRobot
 from imitarm.trajectory import Demonstration, Trajectory
 from scene_shapes import coal_distances
@@ -288,3 +288,18 @@ def test_a_margin_that_is_none_is_rejected():
         adapt(skill, far, tool_radius=RADIUS, margin=0.1)
     with pytest.raises(InputError, match="margin_horizon"):
         adapt(skill, far, tool_radius=RADIUS, margin=CoverageMargin(0.01), margin_horizon=-1.0)
+
+
+def test_the_margin_of_an_estimate_grows_with_the_speed_of_the_obstacle():
+    margin, times = EstimatedMargin(2.0, 0.02, 0.5, 0.06), np.array([0.0, 0.1, 0.2, 2.0])
+    covariance = np.diag([1e-6, 9e-6, 4e-6])
+    known = Sphere([0.5, 0.0, 0.0], 0.03, velocity=[0.3, 0.4, 0.0])
+    rests = Sphere([0.5, 0.0, 0.0], 0.03, covariance=covariance)
+    moves = Sphere([0.5, 0.0, 0.0], 0.03, velocity=[0.3, 0.4, 0.0], covariance=covariance)
+    turns = Sphere([0.5, 0.0, 0.0], 0.1, angular_velocity=[0.0, 0.0, 4.0], covariance=100.0 * covariance)
+    found = margin.at(Scene(None, [known, rests, moves, turns]).packed, times)
+    np.testing.assert_array_equal(found[0], 0.0)
+    np.testing.assert_allclose(found[1], 0.006)
+    np.testing.assert_allclose(found[2], [0.006, 0.031, 0.056, 0.066])
+    np.testing.assert_allclose(found[3], [0.02, 0.04, 0.06, 0.08])
+    np.testing.assert_array_equal(margin.at(Scene(None, [known]).packed, times), np.zeros((1, 4)))

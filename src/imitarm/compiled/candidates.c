@@ -20,6 +20,7 @@ typedef struct {
     const double *times, *A, *B, *gains, *weights, *task, *pull, *candidates, *one_sided, *rates, *waiting;
     const double *radii, *spheres;
     double curvature, change_weight, weight, limit, clearance, width, influence, reach, largest_a, largest_b, rate_time, beta, cap;
+    double growth, growth_cap, lever;
 } LeastCost;
 
 /* The motion at n + 1 phases; rotations: of the tool at each of them, or one for all, or none (n_rotations). */
@@ -104,16 +105,21 @@ static double largest_eigenvalue(const double *a)
     return mean + 2.0 * p * cos(acos(cosine < -1.0 ? -1.0 : cosine > 1.0 ? 1.0 : cosine) / 3.0);
 }
 
-/* The margins by the uncertainty of the observed positions; null if all are exact. */
-static const double *margins_of(Memory *memory, const Obstacles *obstacles, const LeastCost *c)
+/* The margins by the estimates of the obstacles, as RCAMO.estimated_margins; null if all are exact. */
+static const double *margins_of(Memory *memory, const Obstacles *obstacles, const LeastCost *c, double elapsed)
 {
     int exact = 1;
     for (int64_t i = 0; i < 9 * obstacles->n; i++)
         exact = exact && obstacles->covariances[i] == 0.0;
     for (int64_t i = 0; i < obstacles->n && !exact; i++) {
-        double margin = fmin(c->beta * sqrt(fmax(largest_eigenvalue(obstacles->covariances + 9 * i), 0.0)), c->cap);
-        for (int64_t m = 0; m < c->H; m++)
-            memory->margins[c->H * i + m] = margin;
+        const double *v = obstacles->velocities + 3 * i, *omega = obstacles->rates + 3 * i;
+        double sigma = sqrt(fmax(largest_eigenvalue(obstacles->covariances + 9 * i), 0.0));
+        double speed = sqrt(dot(v, v)) + sqrt(dot(omega, omega)) * fmin(obstacles->radii[i], c->lever);
+        speed = sigma > 0.0 ? c->growth * speed : 0.0;
+        for (int64_t m = 0; m < c->H; m++) {
+            double grown = fmin(speed * (elapsed + c->times[m]), c->growth_cap);
+            memory->margins[c->H * i + m] = fmin(c->beta * sigma, c->cap) + grown;
+        }
     }
     return exact ? 0 : memory->margins;
 }
@@ -378,7 +384,7 @@ int64_t least_cost_choice(const Obstacles *obstacles, double dt, const LeastCost
     Memory memory;
     Best best = {0, 0, INFINITY};
     lay_out(&memory, c, obstacles->n, scratch);
-    margins = margins ? margins : margins_of(&memory, obstacles, c);
+    margins = margins ? margins : margins_of(&memory, obstacles, c, s->elapsed);
     int64_t n = find_near(&memory, obstacles, dt, c, path, s, margins);
     if (!n)
         return -1;

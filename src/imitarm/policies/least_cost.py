@@ -163,7 +163,7 @@ class LeastCost:
     size_weight: float = 0.02
     wait_weight: float = 2.0
     rates: tuple[float, ...] = (1.0, 0.5, 0.0, -0.5)
-    sizes: tuple[float, ...] = (0.35, 0.7, 1.0)
+    sizes: tuple[float, ...] = (0.2, 0.5, 1.0)
 
     @cached_property
     def response(self) -> Response:
@@ -205,7 +205,8 @@ class LeastCost:
             spheres: centres of the tool's spheres relative to its tip, shape (S, 3) [m].
             one_sided: directions along which u must have no positive component, shape (m, 3).
             tool_radius: largest distance of the tool's surface from its tip [m].
-            numbers: values of the last three fields of the structure: ``rate_time`` [s], ``beta``, ``cap`` [m].
+            numbers: values of the last fields of the structure: ``rate_time`` [s], ``beta``, ``cap`` [m], ``growth``,
+                ``growth_cap`` [m] and ``lever`` [m].
         """
         cost, response, (task, pull, curvature) = self.obstacle_cost, self.response, self._task
         assert isinstance(cost, DistanceCost)

@@ -20,11 +20,13 @@ like a distance.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.perception.margins import CoverageMargin
+from imitarm.scene.distances import PackedObstacles
 from imitarm.scene.obstacle import Obstacle
 from imitarm.scene.scene import Scene
 from imitarm.validation import finite_number, instance
@@ -57,6 +59,43 @@ class PredictionMargin:
     def slopes_before(self, times: Array) -> Array:
         """Return the time derivative of the margin [m/s] just before each of ``times`` [s]."""
         return np.where(times <= self.until, self.growth, 0.0)
+
+
+class EstimatedMargin(NamedTuple):
+    r"""The margin of RCAMO, which follows from the estimates of the obstacles.
+
+    .. math:: m(t) = \min(\beta \sigma, c) + \min(g\,(|v| + |\omega|\,r)\,t,\ c_g)
+
+    Sigma is the largest standard deviation of the obstacle's observed position. The second term grows with the time t
+    since the observation, because the obstacle may change its velocity. The obstacle has the speed ``|v|`` and the
+    angular speed ``|omega|``; r is the radius of the sphere around it, but at most ``lever``. If an obstacle has no
+    covariance, its motion is known exactly, and its margin is 0.
+
+    Attributes:
+        beta: number of standard deviations.
+        cap: c, largest first term [m].
+        growth: g, fraction of the obstacle's speed.
+        growth_cap: c_g, largest second term [m].
+        lever: largest r [m]; a half-space has no radius.
+    """
+
+    beta: float
+    cap: float
+    growth: float
+    growth_cap: float
+    lever: float = 1.0
+
+    def at(self, packed: PackedObstacles, times: Array) -> Array:
+        """Return the margin of n obstacles at times (H,) [s] since the observation, shape (n, H) [m]."""
+        if not packed.covariances.any():
+            return np.zeros((len(packed), len(times)))
+        sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(packed.covariances)[:, -1], 0.0))
+        v, omega = packed.velocities, packed.angular_velocities
+        speed = np.sqrt(np.sum(omega * omega, axis=1)) * np.minimum(packed.radii, self.lever)
+        speed += np.sqrt(np.sum(v * v, axis=1))
+        speed = np.where(sigma > 0.0, self.growth * speed, 0.0)
+        offset = np.minimum(self.beta * sigma, self.cap)
+        return np.asarray(offset[:, None] + np.minimum(speed[:, None] * times, self.growth_cap))
 
 
 def margins_in(

@@ -26,8 +26,9 @@ from imitarm.policies.headings import allowed_axes, frame, headings
 from imitarm.policies.least_cost import STAY, Choice, LeastCost, Prediction, Response
 from imitarm.policies.obstacle_cost import DistanceCost, GaussianCost, Groups, ObstacleCost, PredictedObstacles
 from imitarm.policies.policy import Observation, Policy
+from imitarm.policies.prediction_margin import EstimatedMargin
 from imitarm.policies.primitive_path import PrimitivePath, learned_precision
-from imitarm.scene.distances import distances
+from imitarm.scene.distances import PackedObstacles, distances
 from imitarm.scene.packed_record import record_of
 from imitarm.scene.scene import Scene
 from imitarm.skills.dmp import DMP
@@ -77,10 +78,11 @@ class RCAMO(Policy):
         gains: stiffness K and damping D of the primitive and of the deviation: ``"critical"`` (critical damping),
             ``"thesis"`` (K = 139.26, D = 28) or Gains.
         margin: a :class:`~imitarm.perception.CoverageMargin`: additional distance that grows with the look-ahead time.
-            None: the additional distance is ``min(beta sigma, cap)``, where sigma is the largest standard deviation of
-            an obstacle's observed position.
-        beta: factor of the standard deviation, see ``margin``.
-        cap: largest additional distance, see ``margin`` [m].
+            None: an :class:`~imitarm.policies.prediction_margin.EstimatedMargin` with the next four arguments.
+        beta: the margin contains this number of standard deviations of an obstacle's observed position.
+        cap: largest part of the margin because of these standard deviations [m].
+        growth: fraction of an obstacle's speed at which the margin grows with the look-ahead time.
+        growth_cap: largest growth of the margin [m].
         time_constant: tau, the time constant of the deviation [s]; the thesis uses 1 s.
         max_acceleration: largest acceleration of the deviation by u, spring and damper together [m/s^2].
         max_push: largest norm of u [m/s^2]. A constant u leads to the deviation ``tau^2 u / K``.
@@ -101,9 +103,11 @@ class RCAMO(Policy):
         margin: CoverageMargin | None = None,
         beta: float = 1.0,
         cap: float = 0.01,
+        growth: float = 0.4,
+        growth_cap: float = 0.05,
         time_constant: float = 2.0,
-        max_acceleration: float = 10.0,
-        max_push: float = 20.0,
+        max_acceleration: float = 13.0,
+        max_push: float = 40.0,
         horizon: int = 12,
         interval: float = 0.05,
         gain: float = 8.0,
@@ -115,8 +119,9 @@ class RCAMO(Policy):
         choice(cost, ("distance", "gaussian"), "RCAMO: cost")
         self.gains = Gains.of(gains, "RCAMO")
         self._margin = None if margin is None else instance(margin, CoverageMargin, "RCAMO: margin")
-        self._beta = finite_number(beta, "RCAMO: beta", at_least=0.0)
-        self._cap = finite_number(cap, "RCAMO: cap", "m", at_least=0.0)
+        given = {"beta": (beta, ""), "cap": (cap, "m"), "growth": (growth, ""), "growth_cap": (growth_cap, "m")}
+        numbers = [finite_number(x, f"RCAMO: {name}", unit, at_least=0.0) for name, (x, unit) in given.items()]
+        self._estimated = EstimatedMargin(*numbers)
         self._tau = finite_number(time_constant, "RCAMO: time_constant", "s", above=0.0)
         self._gain = finite_number(gain, "RCAMO: gain", "1/s", above=0.0)
         self._patience = finite_number(patience, "RCAMO: patience", "m", above=0.0)
@@ -204,7 +209,7 @@ class RCAMO(Policy):
     @cached_property
     def _record(self) -> Record:
         """The C structure ``LeastCost``."""
-        given = self._spheres, self._one_sided, self._tool_radius, _RATE_TIME, self._beta, self._cap
+        given = self._spheres, self._one_sided, self._tool_radius, _RATE_TIME, *self._estimated
         return self.least_cost.record(*given)
 
     # ----- each step
@@ -278,7 +283,7 @@ class RCAMO(Policy):
             self._room = np.empty(kernel.least_cost_scratch(constants, len(packed)))
         elapsed, state, margins = observation.time - observation.scene.stamp, self._state, None
         if self._margin is not None:
-            margins = np.ascontiguousarray(self._margins(packed.covariances, elapsed))
+            margins = np.ascontiguousarray(self._margins(packed, elapsed))
         axes = frame(path.tangent(self._phase), self._axes)
         state[:3], state[3:6], state[6:12] = observation.tool_to_base.position, lag, self._deviation.ravel()
         state[12:15], state[15:18] = self._scaled, self._spring() / self.least_cost.max_push
@@ -336,7 +341,7 @@ class RCAMO(Policy):
         if unbounded.any():
             gap = np.where(unbounded, distances(packed, x[None, None], [elapsed])[:, 0, 0], gap)
         speed = np.sqrt(np.sum(packed.velocities * packed.velocities, axis=1))
-        margin = self._margins(packed.covariances, elapsed)
+        margin = self._margins(packed, elapsed)
         influence = self.least_cost.obstacle_cost.influence(packed) + margin.max(axis=1)
         reach = self._tool_radius + self._travel(path) + influence
         indices = (gap - span * speed <= reach).nonzero()[0]
@@ -352,16 +357,12 @@ class RCAMO(Policy):
         own = np.abs(response.A - 1.0).max() * np.sqrt(e.dot(e)) + np.abs(response.B).max() * np.sqrt(v.dot(v))
         return float(own + self.least_cost.travel + path.speed * self.least_cost.times[-1])
 
-    def _margins(self, covariances: Array, elapsed: float) -> Array:
+    def _margins(self, packed: PackedObstacles, elapsed: float) -> Array:
         """Return the additional distance to each of n obstacles at each instant, shape (n, H) [m]."""
-        n = len(covariances)
+        times = elapsed + self.least_cost.times
         if self._margin is not None:
-            grown = self._margin.at(elapsed + self.least_cost.times)
-            return np.broadcast_to(grown, (n, len(self.least_cost.times)))
-        if not covariances.any():
-            return np.zeros((n, len(self.least_cost.times)))
-        sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[:, -1], 0.0))
-        return np.minimum(self._beta * sigma, self._cap)[:, None] * np.ones(len(self.least_cost.times))
+            return np.broadcast_to(self._margin.at(times), (len(packed), len(times)))
+        return self._estimated.at(packed, times)
 
     def _rotation(self, path: PrimitivePath, tool: Pose, phase: float, dt: float) -> Array:
         """Return the angular velocity that follows the learned rotation, shape (3,) [rad/s]."""
