@@ -43,6 +43,10 @@ static void point_jacobian(double *jacobian, const Arm *arm, const double *point
     for (int64_t k = 0; k < arm->n; k++) {
         const double *w = arm->cdof + 6 * arm->dofs[k], *v = w + 3;
         double *column = jacobian + 3 * k, factor = moves[k];
+        if (factor == 0.0) {
+            column[0] = column[1] = column[2] = 0.0;
+            continue;
+        }
         column[0] = factor * (v[0] + w[1] * c - w[2] * b);
         column[1] = factor * (v[1] + w[2] * a - w[0] * c);
         column[2] = factor * (v[2] + w[0] * b - w[1] * a);
@@ -63,7 +67,8 @@ static double fastest(const double *jacobian, const double *lower, const double 
     for (int64_t k = 0; k < n; k++) {
         const double *column = jacobian + 3 * k;
         double most = fabs(lower[k]) > fabs(upper[k]) ? fabs(lower[k]) : fabs(upper[k]);
-        sum += most * sqrt(column[0] * column[0] + column[1] * column[1] + column[2] * column[2]);
+        double squared = column[0] * column[0] + column[1] * column[1] + column[2] * column[2];
+        sum += squared > 0.0 ? most * sqrt(squared) : 0.0;
     }
     return sum;
 }
@@ -222,6 +227,11 @@ typedef struct {
     const double *base_centers;
 } SpherePairs;
 
+static const double *center_of(const SpherePairs *pairs, const Arm *arm, const double *centers, int64_t sphere)
+{
+    return sphere < arm->m ? centers + 3 * sphere : pairs->base_centers + 3 * (sphere - arm->m);
+}
+
 /* Find every pair nearer than close, at most the nearest `most`, and the nearest pair of each of the n_groups nearest
  * groups that are nearer than near.
  *
@@ -248,7 +258,7 @@ int64_t self_rows(const SpherePairs *pairs, const Arm *arm, const double *center
         for (int64_t k = pairs->starts[g]; k < end; k++) {
             int64_t inner = pairs->inner[k];
             const double *a = centers + 3 * pairs->outer[k];
-            const double *b = inner < arm->m ? centers + 3 * inner : pairs->base_centers + 3 * (inner - arm->m);
+            const double *b = center_of(pairs, arm, centers, inner);
             double x = a[0] - b[0], y = a[1] - b[1], z = a[2] - b[2], sum = pairs->radii[pairs->outer[k]] + pairs->radii[inner];
             double squared = x * x + y * y + z * z, within = sum + (nearest > close ? nearest : close);
             if (within < 0.0 || squared > within * within * (1.0 + 1e-12))
@@ -278,7 +288,7 @@ int64_t self_rows(const SpherePairs *pairs, const Arm *arm, const double *center
         Pair pair = b >= found || (a < kept && nearer(chosen + a, best + b) < 0) ? chosen[a++] : best[b++];
         int64_t outer = pairs->outer[pair.index], inner = pairs->inner[pair.index];
         const double *one = centers + 3 * outer;
-        const double *other = inner < arm->m ? centers + 3 * inner : pairs->base_centers + 3 * (inner - arm->m);
+        const double *other = center_of(pairs, arm, centers, inner);
         double length = pair.distance + pairs->radii[outer] + pairs->radii[inner], normal[3];
         for (int64_t c = 0; c < 3; c++)
             normal[c] = (one[c] - other[c]) / length;

@@ -258,8 +258,13 @@ double signed_distance(const Solid *solid, const double *point, double *normal)
     double offset[3], q[3], local[3];
     for (int c = 0; c < 3; c++)
         offset[c] = point[c] - solid->center[c];
-    if (!normal && solid->kind == SPHERE)
-        return sqrt(dot(offset, offset)) - solid->size[0];
+    if (solid->kind == SPHERE) {
+        double distance = sqrt(dot(offset, offset));
+        for (int c = 0; normal && c < 3 && distance > TINY; c++)
+            normal[c] = offset[c] / distance;
+        if (!normal || distance > TINY)
+            return distance - solid->size[0];
+    }
     for (int c = 0; c < 3; c++)
         q[c] = dot(R + 3 * c, offset);
     double distance = local_distance(solid, q, local);
