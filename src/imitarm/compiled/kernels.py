@@ -30,6 +30,7 @@ _FUNCTIONS: dict[str, tuple[Any, ...]] = {
     "sphere_centers": (_P, _P),
     "self_rows": (*[_P] * 3, _I, _D, _D, _I, _D, _D, _D, *[_P] * 6),
     "track_obstacles": (_I, _I, _D, _D, *[_P] * 3),
+    "track_renew": (*[_I] * 6, _D, _D, *[_P] * 5),
     "track_update": (*[_I] * 4, *[_D] * 5, *[_P] * 3),
 }
 

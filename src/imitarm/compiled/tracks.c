@@ -238,6 +238,94 @@ int64_t track_update(int64_t n, int64_t m, int64_t s, int64_t mask, double stamp
     return all_confirmed && found == n && n == m ? take_over(&t, n, rows, stamp, mask) : 0;
 }
 
+/* Copy track k of a block to track i of another one. */
+static void copy_track(Tracks *to, int64_t i, const Tracks *from, int64_t k, int64_t s)
+{
+    memcpy(to->x + s * i, from->x + s * k, (size_t)s * sizeof(double));
+    memcpy(to->P + s * s * i, from->P + s * s * k, (size_t)(s * s) * sizeof(double));
+    memcpy(to->sizes + 3 * i, from->sizes + 3 * k, 3 * sizeof(double));
+    memcpy(to->quaternions + 4 * i, from->quaternions + 4 * k, 4 * sizeof(double));
+    to->last_seen[i] = from->last_seen[k];
+    to->hits[i] = from->hits[k];
+    to->ages[i] = from->ages[k];
+    to->counts[i] = from->counts[k];
+    to->ids[i] = from->ids[k];
+}
+
+/* Set track i to its first detection; variances: of the components of velocity and acceleration. */
+static void begin_track(Tracks *t, int64_t i, int64_t s, const double *row, double stamp, const double *variances)
+{
+    double *x = t->x + s * i, *P = t->P + s * s * i;
+    memset(x, 0, (size_t)s * sizeof *x);
+    memset(P, 0, (size_t)(s * s) * sizeof *P);
+    for (int64_t r = 0; r < s; r++)
+        P[s * r + r] = r < 3 ? 0.0 : variances[r / 3 - 1];
+    for (int r = 0; r < 3; r++) {
+        x[r] = row[r];
+        memcpy(P + s * r, row + 3 + 3 * r, 3 * sizeof *P);
+    }
+    memcpy(t->sizes + 3 * i, row + 12, 3 * sizeof *row);
+    memcpy(t->quaternions + 4 * i, row + 15, 4 * sizeof *row);
+    t->last_seen[i] = stamp;
+    t->hits[i] = t->ages[i] = t->counts[i] = 1;
+    t->ids[i] = UNCONFIRMED;
+}
+
+static int64_t number_of_bits(int64_t word)
+{
+    int64_t n = 0;
+    for (; word; word &= word - 1)
+        n++;
+    return n;
+}
+
+/* Take over what the detections of an update say, end tracks, begin tracks, and confirm tracks.
+ *
+ * block: n tracks after track_update without the flag ALL_SEEN; anew (n): 1 where the kind of shape has changed.
+ * needed, window: hits and updates after which a track is confirmed. variances: as in begin_track. Out: at most
+ * n + m tracks, where `detections` has the index of each track before, or n + j for detection j. Returns their
+ * number. */
+int64_t track_renew(int64_t n, int64_t m, int64_t s, int64_t needed, int64_t window, int64_t next_id, double stamp,
+                    double max_unseen, const double *variances, const double *rows, const int8_t *anew, double *block,
+                    double *out)
+{
+    Tracks t = tracks_at(block, n, s), to;
+    int64_t kept = 0, mask = ((int64_t)1 << window) - 1, born = m;
+    for (int64_t i = 0; i < n; i++) {
+        t.hits[i] = t.hits[i] << 1 & mask;
+        t.ages[i]++;
+        if (t.detections[i] >= 0) {
+            const double *row = rows + ROW * t.detections[i];
+            double weight = (double)(t.counts[i] = anew[i] ? 1 : t.counts[i] + 1);
+            weight = weight < FULL_COUNT ? weight : FULL_COUNT;
+            t.hits[i] |= 1;
+            t.last_seen[i] = stamp;
+            for (int c = 0; c < 3; c++)
+                t.sizes[3 * i + c] += (row[12 + c] - t.sizes[3 * i + c]) / weight;
+            memcpy(t.quaternions + 4 * i, row + 15, 4 * sizeof *row);
+            born--;
+        }
+        int alive = stamp - t.last_seen[i] <= max_unseen + 1e-9;
+        alive = alive && (t.ids[i] != UNCONFIRMED || t.ages[i] < window || number_of_bits(t.hits[i]) >= needed);
+        kept += alive;
+        t.distances[i] = alive ? 1.0 : 0.0; /* no longer needed here */
+    }
+    to = tracks_at(out, kept + born, s);
+    kept = 0;
+    for (int64_t i = 0; i < n + m; i++) {
+        if (i < n ? t.distances[i] == 0.0 : t.owners[i - n] >= 0)
+            continue;
+        if (i < n)
+            copy_track(&to, kept, &t, i, s);
+        else
+            begin_track(&to, kept, s, rows + ROW * (i - n), stamp, variances);
+        if (to.ids[kept] == UNCONFIRMED && number_of_bits(to.hits[kept]) >= needed)
+            to.ids[kept] = next_id++;
+        to.detections[kept++] = i;
+    }
+    return kept;
+}
+
 /* The obstacles of all tracks, dt later, where dt >= 0; they do not rotate.
  *
  * shapes: the same obstacles at any time. Out: the structure Obstacles; positions, velocities and angular velocities

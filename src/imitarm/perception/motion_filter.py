@@ -226,6 +226,7 @@ class MotionFilter:
         noise: spectral density ``q`` of each model [m^2/s^3 for order 1, m^2/s^5 for order 2].
         initial_speed: standard deviation of each component of a new obstacle's velocity [m/s].
         size: number ``m`` of components of the state.
+        variances: variances of each component of a new obstacle's velocity and acceleration [m^2/s^2, m^2/s^4].
     """
 
     def __init__(self, motion: str, noise: float | Sequence[float] | None, initial_speed: float) -> None:
@@ -241,6 +242,7 @@ class MotionFilter:
             self._fill(k, order, q)
         self._powers = np.arange(len(self._noise) + 1)
         self._unit = np.eye(m)
+        self.variances = self.initial_speed**2, INITIAL_ACCELERATION**2
 
     def _fill(self, k: int, order: int, q: float) -> None:
         """Fill in the matrices of model ``k``; entry ``i, j`` of F is ``dt^(j-i) / (j-i)!``."""
@@ -272,7 +274,7 @@ class MotionFilter:
         mean, covariance = np.zeros((k, models, m)), np.zeros((k, models, m, m))
         mean[..., :3] = positions[:, None]
         covariance[..., :3, :3] = noise[:, None]
-        variances = (0.0, self.initial_speed**2, INITIAL_ACCELERATION**2)
+        variances = 0.0, *self.variances
         for model, order in enumerate(self.orders):
             for i in range(3, 3 * (order + 1)):
                 covariance[:, model, i, i] = variances[i // 3]

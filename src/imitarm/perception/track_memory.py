@@ -113,6 +113,40 @@ def updated(
     return None if flags < 0 else (TrackMemory(n, s, after), flags)
 
 
+def renewed(
+    memory: TrackMemory,
+    stamp: float,
+    rows: bytes,
+    anew: bytes,
+    variances: bytes,
+    *numbers: int,
+    max_unseen: float,
+) -> TrackMemory:
+    """Take over what the detections of an update say, end and begin tracks, and confirm tracks.
+
+    The compiled code computes the same as the methods ``_seen``, ``_pruned``, ``_born`` and ``_confirmed`` of
+    ``ObstacleTracker``.
+
+    Args:
+        memory: result of :func:`updated` without the flag ``ALL_SEEN``; this call changes it.
+        stamp: time of the detections [s].
+        rows: see :func:`updated`.
+        anew: 1 for each track whose detection has another kind of shape than the detection before, otherwise 0.
+        variances: variances of each component of a new track's velocity and acceleration, shape (2,), as bytes.
+        numbers: hits and updates after which a track is confirmed, and number of the next track.
+        max_unseen: time after the last detection at which a track ends [s].
+
+    Returns:
+        The new tracks. Their ``detected`` contains the index of each track in ``memory``, or n + j for a track that
+        begins with detection j.
+    """
+    (n, s, block), m = memory, len(rows) // _ROW_BYTES
+    after = Block(np.empty((n + m) * (s + s * s + _WORDS)))
+    places = variances, rows, anew, block.address, after.address
+    count: int = library().track_renew(n, m, s, *numbers, stamp, max_unseen, *places)
+    return TrackMemory(count, s, after)
+
+
 def obstacles(memory: TrackMemory, dt: float, noise: float, shapes: PackedObstacles) -> PackedObstacles | None:
     """Return the obstacles of all tracks ``dt`` [s] later; None without compiled code, or if ``dt`` is negative.
 

@@ -17,7 +17,7 @@ from imitarm.perception.consistency import Consistency, chi_square_quantile
 from imitarm.perception.detection import Detection
 from imitarm.perception.motion_filter import Belief, Measurements, MotionFilter
 from imitarm.perception.rotation_rate import Rates, turned, turned_on
-from imitarm.perception.track_memory import ALL_SEEN, IN_ORDER, RESIZED, obstacles, updated
+from imitarm.perception.track_memory import ALL_SEEN, IN_ORDER, RESIZED, TrackMemory, obstacles, renewed, updated
 from imitarm.perception.tracks import UNCONFIRMED, TrackedObstacle, Tracks, smoothed_sizes
 from imitarm.scene import Obstacle, Scene
 from imitarm.validation import finite_number, instance, sequence, whole_number
@@ -326,8 +326,26 @@ class ObstacleTracker:
                 if i >= 0 and label != (other := detections[i].label) and label and other:
                     return None
         seen = (index >= 0).nonzero()[0]
-        belief = Belief(memory.array("mean"), memory.array("covariance"), np.ones((memory.n, 1)))
-        return belief, Pairs(seen, index[seen], memory.array("distances")[seen])
+        pairs = Pairs(seen, index[seen], memory.array("distances")[seen])
+        fits = len(tracks.ids) + len(detections) <= self.max_obstacles
+        if fits and not self.rotations and not flags & ALL_SEEN:
+            return _Step(stamp, detections, self._renewed(tracks, memory, stamp, detections, rows), pairs.distances)
+        return Belief(memory.array("mean"), memory.array("covariance"), np.ones((memory.n, 1))), pairs
+
+    def _renewed(
+        self, tracks: Tracks, memory: TrackMemory, stamp: float, detections: tuple[Detection, ...], rows: bytes
+    ) -> Tracks:
+        """Return the tracks after an update in which some tracks were not seen, began or ended; by compiled code.
+
+        The number of tracks and detections together must be at most ``max_obstacles``.
+        """
+        index = memory.array("detected").tolist()
+        seen = [old if i < 0 else detections[i] for i, old in zip(index, tracks.detections, strict=True)]
+        anew = bytes([a.solid.kind != b.solid.kind for a, b in zip(seen, tracks.detections, strict=True)])
+        labels = [d.label or old for d, old in zip(seen, tracks.labels, strict=True)]
+        variances, numbers = np.array(self.filter.variances).tobytes(), (*self.confirm, tracks.next_id)
+        after = renewed(memory, stamp, rows, anew, variances, *numbers, max_unseen=self.max_unseen)
+        return tracks.renewed(after, stamp, (*seen, *detections), (*labels, *[d.label for d in detections]))
 
     def _measurements(self, detections: tuple[Detection, ...], table: Array) -> Measurements:
         """Return the detections, whose rows are ``table`` (k, 15), as measurements."""

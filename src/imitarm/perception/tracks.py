@@ -91,6 +91,24 @@ class Tracks:
         )
         return seen
 
+    def renewed(
+        self, memory: TrackMemory, stamp: float, detections: tuple[Detection, ...], labels: tuple[str, ...]
+    ) -> Tracks:
+        """Return tracks after compiled code has ended or begun some of them; they do not rotate.
+
+        Args:
+            memory: the new tracks.
+            stamp: time of the last update [s].
+            detections: the last detection of each of these n tracks, then all detections of the update.
+            labels: the last labels of the same, where they are not empty.
+        """
+        tracks, sources, ids = object.__new__(Tracks), memory.array("detected").tolist(), memory.array("ids")
+        next_id = max([self.next_id, *(number + 1 for number in ids.tolist())])
+        tracks.__dict__.update(filter=self.filter, stamp=stamp, memory=memory, ids=ids, next_id=next_id)
+        chosen, named = tuple([detections[k] for k in sources]), tuple([labels[k] for k in sources])
+        tracks.__dict__.update(rates=Rates.none(memory.n), detections=chosen, labels=named)
+        return tracks
+
     def __getattr__(self, name: str) -> Any:
         """Make the arrays of tracks that are in a block of memory; reject unknown attributes."""
         memory: TrackMemory | None = self.__dict__.get("memory")
