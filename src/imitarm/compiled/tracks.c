@@ -281,12 +281,12 @@ static int64_t number_of_bits(int64_t word)
 
 /* Take over what the detections of an update say, end tracks, begin tracks, and confirm tracks.
  *
- * block: n tracks after track_update without the flag ALL_SEEN; anew (n): 1 where the kind of shape has changed.
+ * block: n tracks after track_update without the flag ALL_SEEN; changed (n): 1 where the kind of shape has changed.
  * needed, window: hits and updates after which a track is confirmed. variances: as in begin_track. Out: at most
  * n + m tracks, where `detections` has the index of each track before, or n + j for detection j. Returns their
  * number. */
 int64_t track_renew(int64_t n, int64_t m, int64_t s, int64_t needed, int64_t window, int64_t next_id, double stamp,
-                    double max_unseen, const double *variances, const double *rows, const int8_t *anew, double *block,
+                    double max_unseen, const double *variances, const double *rows, const int8_t *changed, double *block,
                     double *out)
 {
     Tracks t = tracks_at(block, n, s), to;
@@ -296,7 +296,7 @@ int64_t track_renew(int64_t n, int64_t m, int64_t s, int64_t needed, int64_t win
         t.ages[i]++;
         if (t.detections[i] >= 0) {
             const double *row = rows + ROW * t.detections[i];
-            double weight = (double)(t.counts[i] = anew[i] ? 1 : t.counts[i] + 1);
+            double weight = (double)(t.counts[i] = changed[i] ? 1 : t.counts[i] + 1);
             weight = weight < FULL_COUNT ? weight : FULL_COUNT;
             t.hits[i] |= 1;
             t.last_seen[i] = stamp;

@@ -117,7 +117,7 @@ def renewed(
     memory: TrackMemory,
     stamp: float,
     rows: bytes,
-    anew: bytes,
+    changed: bytes,
     variances: bytes,
     *numbers: int,
     max_unseen: float,
@@ -131,7 +131,7 @@ def renewed(
         memory: result of :func:`updated` without the flag ``ALL_SEEN``; this call changes it.
         stamp: time of the detections [s].
         rows: see :func:`updated`.
-        anew: 1 for each track whose detection has another kind of shape than the detection before, otherwise 0.
+        changed: 1 for each track whose detection has another kind of shape than the detection before, otherwise 0.
         variances: variances of each component of a new track's velocity and acceleration, shape (2,), as bytes.
         numbers: hits and updates after which a track is confirmed, and number of the next track.
         max_unseen: time after the last detection at which a track ends [s].
@@ -142,7 +142,7 @@ def renewed(
     """
     (n, s, block), m = memory, len(rows) // _ROW_BYTES
     after = Block(np.empty((n + m) * (s + s * s + _WORDS)))
-    places = variances, rows, anew, block.address, after.address
+    places = variances, rows, changed, block.address, after.address
     count: int = library().track_renew(n, m, s, *numbers, stamp, max_unseen, *places)
     return TrackMemory(count, s, after)
 

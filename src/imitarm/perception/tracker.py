@@ -341,10 +341,10 @@ class ObstacleTracker:
         """
         index = memory.array("detected").tolist()
         seen = [old if i < 0 else detections[i] for i, old in zip(index, tracks.detections, strict=True)]
-        anew = bytes([a.solid.kind != b.solid.kind for a, b in zip(seen, tracks.detections, strict=True)])
+        changed = bytes([a.solid.kind != b.solid.kind for a, b in zip(seen, tracks.detections, strict=True)])
         labels = [d.label or old for d, old in zip(seen, tracks.labels, strict=True)]
         variances, numbers = np.array(self.filter.variances).tobytes(), (*self.confirm, tracks.next_id)
-        after = renewed(memory, stamp, rows, anew, variances, *numbers, max_unseen=self.max_unseen)
+        after = renewed(memory, stamp, rows, changed, variances, *numbers, max_unseen=self.max_unseen)
         return tracks.renewed(after, stamp, (*seen, *detections), (*labels, *[d.label for d in detections]))
 
     def _measurements(self, detections: tuple[Detection, ...], table: Array) -> Measurements:
