@@ -335,13 +335,13 @@ class Rollout:
         velocities: measured joint velocities (n, n_joints) [rad/s].
         torques: torques of the joints' drives (n, n_joints) [N m].
         clearance: smallest distance between the arm (with its tool) and any obstacle (n,) [m]; negative when arm and
-            obstacle overlap, inf without obstacles.
+            obstacle overlap, inf without obstacles; nan in all samples if the robot can't measure it.
         success: whether the motion reached its end within the time limit.
         reason: explanation of why the motion ended.
         details: further measurements of the robot or the task, by name.
 
     Raises:
-        InputError: when shapes disagree, or a number is NaN.
+        InputError: when shapes disagree, or a number is NaN. Only ``clearance`` may consist of NaN, as a whole.
     """
 
     trajectory: Trajectory
@@ -360,8 +360,9 @@ class Rollout:
         for name, unit in (("velocities", "rad/s"), ("torques", "N m")):
             object.__setattr__(self, name, _frozen(getattr(self, name), joints.shape, f"Rollout: {name}", unit))
         clearance = real_array(self.clearance, (n,), "Rollout: clearance", "m").copy()
-        if np.isnan(clearance).any():
-            raise InputError(f"Rollout: clearance [m] is NaN in row {int(np.argmax(np.isnan(clearance)))}")
+        unknown = np.isnan(clearance)
+        if unknown.any() and not unknown.all():
+            raise InputError(f"Rollout: clearance [m] is NaN in row {int(np.argmax(unknown))}, but not in all rows")
         clearance.setflags(write=False)
         object.__setattr__(self, "clearance", clearance)
         object.__setattr__(self, "success", flag(self.success, "Rollout: success"))
@@ -371,7 +372,7 @@ class Rollout:
     def __repr__(self) -> str:
         samples, duration, *_ = self.trajectory._facts()
         success = "succeeded" if self.success else "failed"
-        return f"Rollout({success}, {samples}, {duration}, smallest clearance {self.min_clearance:.4g} m)"
+        return f"Rollout({success}, {samples}, {duration}, smallest clearance {self._clearance_text})"
 
     def _repr_html_(self) -> str:
         samples, *facts = self.trajectory._facts()
@@ -380,7 +381,7 @@ class Rollout:
             "reason": self.reason,
             "samples": samples.split()[0],
             "motion": ", ".join(facts),
-            "smallest clearance": f"{self.min_clearance:.4g} m",
+            "smallest clearance": self._clearance_text,
             "largest joint velocity": f"{np.abs(self.velocities).max(initial=0.0):.4g} rad/s",
             "largest torque": f"{np.abs(self.torques).max(initial=0.0):.4g} N m",
         }
@@ -388,8 +389,12 @@ class Rollout:
 
     @property
     def min_clearance(self) -> float:
-        """Smallest clearance of the whole motion [m]."""
+        """Smallest clearance of the whole motion [m]; nan if it was not measured."""
         return float(np.min(self.clearance, initial=np.inf))
+
+    @property
+    def _clearance_text(self) -> str:
+        return "not measured" if np.isnan(self.min_clearance) else f"{self.min_clearance:.4g} m"
 
 
 def _triple(position: Array) -> str:

@@ -270,7 +270,7 @@ class _Job(Generic[Work, Outcome]):
     def __call__(self, work: Work) -> tuple[Work, Outcome]:
         """Return the experiment and its result."""
         if self.parent:
-            _end_with(self.parent)
+            end_with(self.parent)
         if code_version() != self.version:
             raise TaskFailedError(
                 f"a worker runs another version of the code ({code_version()}) than the benchmark ({self.version}); "
@@ -280,8 +280,12 @@ class _Job(Generic[Work, Outcome]):
 
 
 @lru_cache(maxsize=1)
-def _end_with(parent: int) -> None:
-    """End this worker process when its parent process has ended, because workers survive if the parent is killed."""
+def end_with(parent: int) -> None:
+    """End this process when its parent process has ended; otherwise, worker processes outlive a killed parent.
+
+    Args:
+        parent: id of the parent process.
+    """
     if os.getpid() == parent:  # jobs run in the main process
         return
     if os.getppid() != parent:

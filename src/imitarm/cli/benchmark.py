@@ -23,6 +23,7 @@ from imitarm.benchmark.repeated_tasks import REPEATED_TASKS, RepeatedTask
 from imitarm.cli.benchmark_moving import add_moving
 from imitarm.cli.benchmark_options import add_fill, add_workers, place_of, report_tables, workers_of
 from imitarm.cli.benchmark_perception import add_perception
+from imitarm.cli.benchmark_real_time import add_real_time
 from imitarm.cli.benchmark_static import add_static
 from imitarm.cli.benchmark_tracking import add_tracking
 from imitarm.cli.outputs import check_outputs, same_place
@@ -33,7 +34,7 @@ from imitarm.errors import InputError
 from imitarm.policies import POLICIES
 from imitarm.policies.adaptation import ADAPTERS
 
-OTHERS = (add_static, add_moving, add_tracking, add_perception)
+OTHERS = (add_static, add_moving, add_tracking, add_perception, add_real_time)
 """Functions that add the subcommands whose code is in another module."""
 
 EPILOG = """\
@@ -57,6 +58,7 @@ examples:
   imitarm benchmark perception --count 105
   imitarm benchmark moving --count 100 --out moving
   imitarm benchmark moving compare moving --report moving.html
+  imitarm benchmark real-time --duration 60 --rate 1000 --out real_time.json --figure real_time.png
 
 'mapping' saves its results in the folder named by --out, and 'placements' in the file named by --out.
 If you interrupt one of these two commands, the same command later continues where it stopped.

@@ -120,12 +120,12 @@ def command_line() -> str:
     """Return the command line, without names of files that exist only on this machine."""
     words, places = (
         sys.argv[1:],
-        {"--out", "--report", "--fill", "--json", "--markdown", "--jobs", "--backend", "--scheduler"},
+        {"--out", "--report", "--figure", "--fill", "--json", "--markdown", "--jobs", "--backend", "--scheduler"},
     )
     kept = [
         w
         for i, w in enumerate(words)
-        if w not in places | {"--fresh", "--reuse"} and (i == 0 or words[i - 1] not in places)
+        if w not in places | {"--fresh", "--reuse", "--force"} and (i == 0 or words[i - 1] not in places)
     ]
     named = ["recordings" if i > 0 and kept[i - 1] == "--data" else Path(w).name for i, w in enumerate(kept)]
     return shlex.join(["imitarm", *named])

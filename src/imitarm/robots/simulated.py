@@ -159,6 +159,31 @@ class SimulatedRobot(Robot):
         self._drives.hold()
         return self.state()
 
+    def show(self, q: ArrayLike, time: float) -> ArmState:
+        """Place the arm at rest at ``q`` and all obstacles where they are at ``time``, without a simulated motion.
+
+        A second robot with the same scene can thereby show the state of a simulation that runs in another process, for
+        example to a depth camera. All other bodies stay where they are.
+
+        Args:
+            q: joint angles, shape (n_joints,) [rad]. They are not checked against the limits, because a simulated joint
+                can be slightly beyond its limit.
+            time: time since the last reset [s].
+
+        Returns:
+            The state.
+
+        Raises:
+            InputError: when ``q`` has a wrong shape, or a number is not finite.
+        """
+        place = finite_vector(q, self.arm.n_joints, "show: q", "rad")
+        self.data.time = finite_number(time, "show: time", "s")
+        self._drives.place(place)
+        self._begin(place)
+        self._move_obstacles()
+        mujoco.mj_kinematics(self.model, self.data)
+        return self.state()
+
     @property
     def time(self) -> float:
         """Time since the last reset [s]."""
@@ -278,6 +303,9 @@ class SimulatedRobot(Robot):
         if touching:
             self.contact_steps += 1
             self.contacts.update(self._names(pair) for pair in touching)
+        self._move_obstacles()
+
+    def _move_obstacles(self) -> None:
         if self._moving:
             positions, quaternions = self._source.poses(self.scene_at_start.stamp + self.time)
             self.data.mocap_pos[self._mocap] = positions
@@ -376,6 +404,11 @@ class Drives:
     def widest_opening(self) -> float:
         """Largest opening of the gripper [m]; nan without a gripper."""
         return float("nan") if self._gripper is None else float(self._model.actuator_ctrlrange[self._gripper, 1])
+
+    def place(self, q: Array) -> None:
+        """Place the joints at the angles ``q`` (n,) [rad], at rest."""
+        self._data.qpos[self._qpos] = q
+        self._data.qvel[self._dof] = 0.0
 
     def grasp(self, opening: float) -> None:
         """Move the gripper to ``opening`` [m] at 0.12 m/s; its servo applies at most its rated force.

@@ -23,6 +23,7 @@ class RateLimiter:
     Attributes:
         ticks: number of periods since the first start, including missed periods.
         overruns: number of missed periods.
+        late: delay of the current period after its scheduled start, less than one period [s].
 
     Raises:
         InputError: when the period is not at least 1 us.
@@ -39,6 +40,7 @@ class RateLimiter:
         self._clock_ns, self._sleep = clock_ns, sleep
         self._start: int | None = None
         self.ticks = self.overruns = 0
+        self.late = 0.0
 
     @property
     def remaining(self) -> float:
@@ -53,6 +55,7 @@ class RateLimiter:
         if self._start is None:
             self._start = now
         missed = max((now - self._start) // self._period - self.ticks, 0)
+        self.late = 1e-9 * (now - self._start - (self.ticks + missed) * self._period)
         self.ticks += missed + 1
         self.overruns += missed
         return missed
