@@ -152,6 +152,25 @@ def test_an_obstacle_follows_any_function_of_time(arm):
     np.testing.assert_allclose(robot.data.body("obstacle/0").xpos, circling(0.0), atol=1e-9)
 
 
+def test_a_second_robot_shows_the_state_of_the_first(arm):
+    scene = Scene(None, (Sphere([0.9, 0.5, 0.3], 0.05, velocity=[0.0, -0.1, 0.0]), Sphere([0.9, 0, 0.9], 0.1)))
+    one, other = (SimulatedRobot(arm, scene=scene, motion={1: lambda t: [0.9, 0.1 * t, 0.9]}) for _ in range(2))
+    for _ in range(30):
+        one.move(0.3 * np.ones(7), DT)
+    shown = other.show(one.state().q, one.time)
+    assert shown.time == one.time and not shown.velocity.any()
+    np.testing.assert_array_equal(shown.q, one.state().q)
+    np.testing.assert_allclose(other.data.geom_xpos, one.data.geom_xpos, atol=1e-9)
+    np.testing.assert_array_equal(other.scene.packed.positions, one.scene.packed.positions)
+    assert other.clearance() == pytest.approx(one.clearance(), abs=1e-9)
+    other.move(np.zeros(7), DT)  # the shown state is also a start for a motion
+    assert np.abs(other.state().velocity).max() < 0.05
+    with pytest.raises(InputError, match="show: q"):
+        other.show(np.zeros(3), 0.0)
+    with pytest.raises(InputError, match="show: time"):
+        other.show(arm.home, np.nan)
+
+
 def tangent(angle):
     return np.array([-np.sin(angle), np.cos(angle), 0.0])
 

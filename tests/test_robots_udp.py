@@ -3,9 +3,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from imitarm.command import Command
+from imitarm.control_loop import reproduce
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.kinematics.arm import ArmModel
+from imitarm.policies import Policy
 from imitarm.robots import ROBOTS, SimulatedRobot, UdpRobot
+from imitarm.scene import Scene
 from imitarm.transmission.messages import CommandMode, RobotStatus
 from wire_samples import ARM, DT, MS, N, Paper, Served, assert_within_limits, command
 
@@ -282,3 +286,32 @@ def test_the_server_answers_only_who_has_clients_and_bears_a_flood(served):
         assert served.supervisor.dropped["magic"] > 100
         served.sleep(0.1)
         assert not robot.listen()
+
+
+class Nudge(Policy):
+    """Moves the tool up for five steps."""
+
+    def __init__(self):
+        self.steps = 0
+
+    def reset(self, observation):
+        self.steps = 0
+
+    def step(self, observation, dt):
+        self.steps += 1
+        return Command(np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.0]))
+
+    def finished(self, observation):
+        return self.steps >= 5
+
+
+def test_a_remote_robot_reproduces_a_skill_although_its_clearance_is_unknown(led):
+    served, robot = led
+
+    def observe(_):
+        served.sleep(PERIOD)
+        return Scene()
+
+    rollout = reproduce(Nudge(), robot, observe, dt=PERIOD, contact=False)
+    assert rollout.success and np.isnan(rollout.clearance).all()
+    assert rollout.trajectory.positions[-1, 2] > rollout.trajectory.positions[0, 2]

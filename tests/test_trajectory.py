@@ -194,6 +194,12 @@ ZEROS = np.zeros((3, 7))
 ROLLOUT = Rollout(LINE, ZEROS, ZEROS, ZEROS, np.array([0.2, 0.1, np.inf]), True)
 
 
+def test_the_clearance_of_a_rollout_may_be_unknown():
+    unknown = replace(ROLLOUT, clearance=np.full(3, np.nan))
+    assert np.isnan(unknown.min_clearance)
+    assert repr(unknown) == "Rollout(succeeded, 3 samples, 3 s, smallest clearance not measured)"
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -56,3 +56,15 @@ def test_the_first_tick_is_now():
 def test_a_period_that_is_none_is_refused(period):
     with pytest.raises(InputError, match="RateLimiter: period"):
         RateLimiter(period)
+
+
+def test_the_delay_of_a_period_is_reported():
+    time = Time(late=300_000)
+    limiter = RateLimiter(0.01, clock_ns=time, sleep=time.sleep)
+    limiter.wait()
+    assert limiter.late == 0.0
+    limiter.wait()
+    assert limiter.late == pytest.approx(0.0003)
+    time.ns += 24 * MS
+    assert limiter.wait() == 1
+    assert limiter.late == pytest.approx(0.0043)

@@ -15,8 +15,10 @@ import importlib
 import multiprocessing
 import os
 import signal
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
 from types import TracebackType
 from typing import Any, Self
@@ -44,7 +46,6 @@ ROLES = {
 _END_TIME = 5.0  # [s] in which a process must end by itself
 _OTHERS = 0.5  # [s] after the first failure, in which the process that caused the failure becomes known
 _LOST = "lost the connection to another process"
-
 
 _RUNNING, _STOPPING = 1.0, 2.0
 _PHASE, _SCENES, _VERSION, _TIME, _Q = range(5)  # places in the shared memory
@@ -138,14 +139,16 @@ class Processes:
 
         Args:
             name: name of the process, a key of :data:`ROLES`.
-            arguments: arguments of its function. Connections among them are closed in this process, so that the other
-                end of a pipe notices when the started process ends.
+            arguments: arguments of its function, without the shared memory, which is the second argument. Connections
+                among them are closed in this process, so that the other end of a pipe notices when the started process
+                ends.
         """
         receive, send = self.pipe()
         process = self._context.Process(
-            target=_enter, args=(name, arguments, self.shared, send, os.getpid()), name=name, daemon=True
+            target=_enter, args=(ROLES[name], arguments, self.shared, send, os.getpid()), name=name, daemon=True
         )
-        process.start()
+        with _ignoring_interrupts():
+            process.start()
         self._processes[name], self._reports[name] = process, receive
         for connection in (send, *arguments):
             if isinstance(connection, Connection):
@@ -224,11 +227,27 @@ class Processes:
             report.close()
 
 
-def _enter(name: str, arguments: Sequence[Any], shared: Shared, report: Connection, parent: int) -> None:
+@contextmanager
+def _ignoring_interrupts() -> Iterator[None]:
+    """Ignore Ctrl-C in a process that is started in the ``with`` block; its parent then lets it end.
+
+    A new process inherits this setting, so it prints no traceback if Ctrl-C comes while it imports its modules.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _enter(role: str, arguments: Sequence[Any], shared: Shared, report: Connection, parent: int) -> None:
     """Run the function of a process, and report its result or its failure."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent lets the others end
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent lets this one end
     end_with(parent)
-    module, _, function = ROLES[name].partition(":")
+    module, _, function = role.partition(":")
     try:
         run: Callable[..., dict[str, Any]] = getattr(importlib.import_module(module), function)
         report.send((True, run(arguments[0], shared, *arguments[1:])))
