@@ -90,6 +90,7 @@ class Shared:
 
     @scenes.setter
     def scenes(self, number: int) -> None:
+        """Set the number of scenes that the tracker has sent."""
         self._values[_SCENES] = number
 
     @property
