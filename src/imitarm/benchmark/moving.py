@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from imitarm.benchmark.arm_oracle import ORACLES, ArmOracle
-from imitarm.benchmark.moving_arm import OBSERVERS, ROBOTS, arm_case, prepared, run_arm
+from imitarm.benchmark.moving_arm import OBSERVERS, ROBOTS, arm_case, prepared, required, run_arm
 from imitarm.benchmark.moving_controls import CONTROLS, control
 from imitarm.benchmark.moving_measures import OUTCOMES, SUCCESSES, measured
 from imitarm.benchmark.moving_scenes import FAMILIES, MovingCase, moving_case
@@ -178,7 +178,8 @@ class MovingExperiment:
                 found, reason, values = measured(case, run)
             else:
                 case = self.case()
-                policy = build(self.method, case, self.options, self.world)
+                known = replace(case, clearance=required(case, self.observer))
+                policy = build(self.method, known, self.options, self.world)
                 found, reason, values = run_arm(policy, case, self.world, self.sensor, self.observer)
             values["n_obstacles"] = len(case.truth.scene.obstacles)
             values["touched"] = case.touched

@@ -38,10 +38,13 @@ Array = NDArray[np.float64]
 ROBOTS = {"sawyer": "brush", "panda": "gripper"}
 """Name of each arm, and the name of the tool that it holds."""
 OBSERVERS = ("sensor", "camera")
-"""How the obstacles are observed: by the simulated sensor, or by a depth camera that sees the arm and the obstacles."""
-_EYE, _MIDDLE = (1.9, -0.05, 1.1), (0.6, -0.05, 0.0)  # [m] the camera, and the point at which it looks
-_WORKSPACE = ((-0.3, -1.2, -0.7), (1.5, 1.1, 1.0))  # [m] in which the camera's detector searches for obstacles
+"""How the obstacles are observed: by the simulated sensor or by two depth cameras."""
+_EYES = ((1.9, -0.5, 1.1), (-0.9, 1.4, 1.6))  # [m] the cameras: in front of the path, and behind the arm
+_MIDDLES = ((0.6, -0.05, 0.0), (0.2, 0.0, 0.1))  # [m] the points at which they look
+_WORKSPACE = ((-0.9, -1.2, -0.7), (1.5, 1.1, 1.3))  # [m] in which the cameras' detector searches for obstacles
+_CAMERA_MARGIN = 0.01  # [m] added to the required clearance, because shapes from a camera are a little too small
 _SPARE = 0.01  # [m] beyond the required clearance, at the start and at the goal
+_ANGLES = (-0.8, -0.4, 0.0, 0.4, 0.8)  # [rad] of the first joint, from the start
 _INTERVAL = 0.05  # [s] between the instants at which the base is checked
 _STILL = 0.05  # [rad/s] joints slower than this stand
 
@@ -59,9 +62,9 @@ def prepared(robot: str) -> tuple[Skill, ArmModel, Array]:
 def arm_case(robot: str, family: str, seed: int) -> MovingCase:
     """Return a scene around the path of the skill 'sweep'.
 
-    No obstacle overlaps the arm at the start, or its tool at the goal. No obstacle comes near the fixed base of the arm
-    during the run, because the base can't evade an obstacle. If the scene of a seed breaks these rules, the scene of a
-    seed that is 10 000 larger replaces it.
+    No obstacle overlaps the arm at the start, or its tool at the goal. No obstacle comes near the base of the arm or
+    its first link during the run, because these parts can't evade an obstacle. If the scene of a seed breaks these
+    rules, the scene of a seed that is 10 000 larger replaces it.
 
     Raises:
         InputError: when none of 20 seeds gives a scene that keeps these rules.
@@ -74,7 +77,7 @@ def arm_case(robot: str, family: str, seed: int) -> MovingCase:
         case = moving_case(family, 3, number, skill=skill)
         early = _least_gap(case, np.linspace(-0.5, 0.3, 9), centers, radii)
         late = _least_gap(case, skill.duration_ * np.linspace(1.0, LONGEST, 15), tool, arm.tool_spheres[:, 3])
-        if min(early, late) > case.clearance + _SPARE and _leaves_base_free(case, arm):
+        if min(early, late) > case.clearance + _SPARE and _leaves_base_free(case, arm, start):
             return case
     raise InputError(
         f"{family}, seed {seed}: in every scene that was tried, an obstacle is too near to the {robot}; "
@@ -82,15 +85,22 @@ def arm_case(robot: str, family: str, seed: int) -> MovingCase:
     )
 
 
-def _leaves_base_free(case: MovingCase, arm: ArmModel) -> bool:
-    """Return whether no obstacle comes near the fixed base of the arm, from before the start to the end of the run."""
+def _leaves_base_free(case: MovingCase, arm: ArmModel, start: Array) -> bool:
+    """Return whether no obstacle comes near the base or the first link, from before the start to the end of the run.
+
+    The first joint only rotates the first link about its own axis, so this link is checked at several angles.
+    """
     times = np.arange(-0.5, LATEST * case.skill.duration_, _INTERVAL)
-    base, radii, reach = arm.cover.base_centers, arm.cover.base_radii, case.truth.scene.packed.radii
+    first = arm.cover.links == 1
+    turned = [arm.collision_spheres(start + angle * np.eye(len(start))[0])[0][first] for angle in _ANGLES]
+    fixed = np.concatenate([arm.cover.base_centers, *turned])
+    radii = np.concatenate([arm.cover.base_radii, *[arm.cover.radii[first]] * len(_ANGLES)])
+    reach = case.truth.scene.packed.radii
     obstacles = np.array([case.truth.poses(float(time))[0] for time in times])
-    middle = base.mean(axis=0)
-    size = float((np.linalg.norm(base - middle, axis=1) + radii).max())
+    middle = fixed.mean(axis=0)
+    size = float((np.linalg.norm(fixed - middle, axis=1) + radii).max())
     near = (np.linalg.norm(obstacles - middle, axis=2) - reach < size + case.clearance).any(axis=1)
-    return not near.any() or _least_gap(case, times[near], base, radii) > case.clearance
+    return not near.any() or _least_gap(case, times[near], fixed, radii) > case.clearance
 
 
 def _least_gap(case: MovingCase, times: Array, centers: Array, radii: Array) -> float:
@@ -130,6 +140,11 @@ class _Timed(Policy):
         return self._policy.finished(observation)
 
 
+def required(case: MovingCase, observer: str) -> float:
+    """Return the clearance that policy and safety filter must keep from the observed obstacles [m]."""
+    return case.clearance + (_CAMERA_MARGIN if observer == "camera" else 0.0)
+
+
 def run_arm(
     policy: Policy, case: MovingCase, robot: str, sensor: SensorModel, observer: str = OBSERVERS[0]
 ) -> tuple[str, str, dict[str, Any]]:
@@ -149,12 +164,12 @@ def run_arm(
     seen = delayed(case.truth) if observer == "camera" else case.truth
     body = SimulatedRobot(arm, scene=seen.scene, motion=seen.motions, q=start)
     run, steps = ToolRun(), list[Step]()
-    safety = SafetyFilter(arm, dt=DT, clearance=case.clearance)
+    safety = SafetyFilter(arm, dt=DT, clearance=required(case, observer))
     tracker = ObstacleTracker("imm")
     observe: Callable[[float], Scene]
     if observer == "camera":
         fixtures = standard_fixtures()
-        observe = watched(body, _EYE, _MIDDLE, _WORKSPACE, surfaces=fixtures, tracker=tracker, seed=sensor.seed)
+        observe = watched(body, _EYES, _MIDDLES, _WORKSPACE, surfaces=fixtures, tracker=tracker, seed=sensor.seed)
     else:
         observe = TrackedScene(case.truth, sensor, tracker)
     try:

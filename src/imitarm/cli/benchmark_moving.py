@@ -48,7 +48,7 @@ def add_moving(parsers: Any) -> None:
         choices=OBSERVERS,
         default=OBSERVERS[0],
         help="sensor: the positions of the obstacles, with noise (the default); "
-        "camera: a simulated depth camera, only with --world sawyer panda",
+        "camera: two simulated depth cameras, only with --world sawyer panda",
     )
     moving.add_argument("--dimensions", nargs="+", type=int, choices=(2, 3), default=[2, 3], help="default: 2 3")
     moving.add_argument(

@@ -95,8 +95,8 @@ def watched(
 
     Args:
         robot: the simulated robot, at rest.
-        eye: position of the camera in the base frame, shape (3,) [m].
-        middle: point at which the camera looks, in the base frame, shape (3,) [m].
+        eye: position of the camera in the base frame, shape (3,) [m]; several cameras have one row each, shape (n, 3).
+        middle: point at which the camera looks, in the base frame, shape (3,) [m]; one row for each of several cameras.
         workspace: lowest and highest corner of the box in which obstacles are searched, shape (2, 3) [m].
         surfaces: known surfaces, such as the table top, which the detector must not report as obstacles. They must not
             be larger than in the simulated world.
@@ -106,7 +106,10 @@ def watched(
         seed: seed of the camera's noise.
     """
     observe = CameraObserver(
-        camera_in_front(robot, eye, middle, seed=seed).frame,
+        [
+            camera_in_front(robot, one, at, seed=seed + 1_000_000 * number).frame
+            for number, (one, at) in enumerate(zip(np.atleast_2d(eye), np.atleast_2d(middle), strict=True))
+        ],
         ObstacleDetector(robot.arm, surfaces=surfaces, workspace=workspace),
         ObstacleTracker() if tracker is None else tracker,
         joints=lambda: robot.state().q,
