@@ -336,7 +336,7 @@ def test_a_whole_arm_moves_among_the_same_obstacles():
 @pytest.mark.slow
 def test_a_camera_sees_the_obstacles_of_a_whole_arm():
     result = MovingExperiment("M1", 3, 1000, "rcamo", world="sawyer", observer="camera").run()
-    assert result.outcome == "success" and result.value("clearance") > 0.0, result.reason
+    assert result.success and result.value("clearance") > 0.0, result.reason
     assert result.value("position_error") < 0.05 and result.value("unseen") > 0.0  # it comes from outside of the view
     assert RESULTS.result(RESULTS.line(result)).experiment == result.experiment
     both = MovingResults([result, replace(result, experiment=replace(result.experiment, observer="sensor"))])
