@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import ctypes
 import pickle
 
 import numpy as np
@@ -17,8 +18,11 @@ from imitarm.perception import Detection, ObstacleTracker
 from imitarm.perception.motion_filter import MotionFilter
 from imitarm.perception.track_memory import TrackMemory, updated
 from imitarm.perception.tracks import UNCONFIRMED
-from imitarm.scene import Box, ConvexHull, Sphere
+from imitarm.scene import Box, ConvexHull, Scene, Sphere
 from imitarm.scene.clearance_limit import ClearanceLimit
+from imitarm.scene.distances import resized
+from imitarm.scene.packed_record import RECORD_WORDS, record_of
+from scene_shapes import KINDS, random_obstacle
 
 ARM = ArmModel.load("sawyer", tool="gripper")
 
@@ -160,3 +164,36 @@ def test_copies_of_tracker_and_scene_go_on_alike():
         np.testing.assert_array_equal(rows.lower, expected.lower)
         other.update(0.5, frames[5])
         np.testing.assert_array_equal(other.scene(0.5).packed.positions, tracker.scene(0.5).packed.positions)
+
+
+@pytest.mark.parametrize("way", ["compiled", "NumPy"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_sizes_of_a_scene_follow_the_detections(kind, way):
+    """Arrays, obstacles and distances agree, although the scene's obstacles are not built again."""
+    rng = np.random.default_rng(0)
+    first = random_obstacle(kind, rng)
+    size = np.asarray(first.solid().size, dtype=float)
+
+    def last() -> Scene:
+        tracker = ObstacleTracker()
+        for k in range(5):
+            tracker.update(0.1 * k, [Detection(resized(first, (1.0 + 0.02 * k) * size), 1e-6 * np.eye(3))])
+            scene = tracker.scene(0.1 * k + 0.01)
+        return scene
+
+    scene = last() if way == "compiled" else by_numpy(last)
+    built = Scene(None, scene.obstacles)
+    if kind != "convex_hull":
+        assert (scene.packed.sizes[0][size > 0.0] > size[size > 0.0]).all()
+    np.testing.assert_allclose(scene.packed.sizes, built.packed.sizes, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(scene.packed.radii, built.packed.radii, rtol=0.0, atol=1e-9)
+    record = record_of(scene.packed)[0]
+    radius = ctypes.c_double.from_address(record_words(record)[8]).value
+    np.testing.assert_allclose(radius, built.packed.radii, rtol=0.0, atol=1e-9)
+    points = rng.uniform(-1.0, 1.0, (20, 3))
+    np.testing.assert_allclose(scene.distances(points), built.distances(points), rtol=0.0, atol=1e-9)
+
+
+def record_words(record) -> list[int]:
+    """Return the words of a C structure ``Obstacles``."""
+    return list((ctypes.c_int64 * RECORD_WORDS).from_address(record.address))

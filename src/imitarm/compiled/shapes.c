@@ -252,6 +252,23 @@ static double local_distance(const Solid *solid, const double *q, double *normal
     }
 }
 
+double bounding_radius(int kind, const double *size)
+{
+    switch (kind) {
+    case BOX:
+        return 0.5 * sqrt(dot(size, size));
+    case CAPSULE:
+        return size[0] + 0.5 * size[1];
+    case CYLINDER:
+    case CONE:
+        return sqrt(size[0] * size[0] + 0.25 * size[1] * size[1]);
+    case HALF_SPACE:
+        return INFINITY;
+    default:
+        return fmax(size[0], fmax(size[1], size[2]));
+    }
+}
+
 double signed_distance(const Solid *solid, const double *point, double *normal)
 {
     const double *R = solid->to_local;

@@ -26,6 +26,9 @@ typedef struct {
     const Hull *hull;
 } Solid;
 
+/* Radius of the sphere around the origin of a shape that contains it; not for hulls. */
+double bounding_radius(int kind, const double *size);
+
 /* Place obstacle i of a scene, dt seconds after the time of the arrays. */
 void place(Solid *solid, const Obstacles *obstacles, int64_t i, double dt);
 

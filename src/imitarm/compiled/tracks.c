@@ -15,7 +15,6 @@
 #define UNCONFIRMED -1 /* the same */
 #define ALL_SEEN 1     /* every track is confirmed and has one of the detections, and no detection is left */
 #define IN_ORDER 2     /* and detection i belongs to track i */
-#define RESIZED 4      /* and a smoothed size has changed */
 
 /* n tracks in one block of memory, as imitarm.perception.track_memory lays them out. */
 typedef struct {
@@ -199,11 +198,8 @@ static int64_t take_over(Tracks *t, int64_t n, const double *rows, double stamp,
         t->hits[i] = (t->hits[i] << 1 & mask) | 1;
         t->ages[i]++;
         t->last_seen[i] = stamp;
-        for (int c = 0; c < 3; c++) {
-            double error = row[12 + c] - t->sizes[3 * i + c];
-            t->sizes[3 * i + c] += error / weight;
-            flags |= error != 0.0 ? RESIZED : 0;
-        }
+        for (int c = 0; c < 3; c++)
+            t->sizes[3 * i + c] += (row[12 + c] - t->sizes[3 * i + c]) / weight;
         memcpy(t->quaternions + 4 * i, row + 15, 4 * sizeof(double));
         if (t->detections[i] != i)
             flags &= ~IN_ORDER;
@@ -328,18 +324,19 @@ int64_t track_renew(int64_t n, int64_t m, int64_t s, int64_t needed, int64_t win
 
 /* The obstacles of all tracks, dt later, where dt >= 0; they do not rotate.
  *
- * shapes: the same obstacles at any time. Out: the structure Obstacles; positions, velocities and angular velocities
- * (n, 3); covariances (n, 3, 3); times at which they were seen (n); the square of the largest speed (1). Other arrays
- * are those of the shapes, or of the block. */
+ * shapes: the same obstacles at any time, with other sizes. Out: the structure Obstacles; positions, velocities and
+ * angular velocities (n, 3); covariances (n, 3, 3); times at which they were seen (n); sizes (n, 3); radii (n); the
+ * square of the largest speed (1). Other arrays are those of the shapes, or of the block. Returns whether a size is not
+ * that of the shapes. */
 int64_t track_obstacles(int64_t n, int64_t s, double dt, double q, double *block, const Obstacles *shapes, double *out)
 {
     Tracks t = tracks_at(block, n, s);
     Obstacles *placed = (Obstacles *)out;
     double *positions = out + sizeof(Obstacles) / sizeof(double), *velocities = positions + 3 * n;
     double *rates = velocities + 3 * n, *covariances = rates + 3 * n, *stamps = covariances + 9 * n;
+    double *sizes = stamps + n, *radii = sizes + 3 * n;
     double x[MAX_STATE], P[MAX_STATE * MAX_STATE], fastest = 0.0;
-    if (s > MAX_STATE || dt < 0.0)
-        return -1;
+    int resized = 0;
     for (int64_t i = 0; i < n; i++) {
         memcpy(x, t.x + s * i, (size_t)s * sizeof *x);
         memcpy(P, t.P + s * s * i, (size_t)(s * s) * sizeof *P);
@@ -351,6 +348,12 @@ int64_t track_obstacles(int64_t n, int64_t s, double dt, double q, double *block
             memcpy(covariances + 9 * i + 3 * r, P + s * r, 3 * sizeof *P);
         }
         stamps[i] = t.last_seen[i];
+        const double *size = shapes->hulls[i] ? shapes->sizes + 3 * i : t.sizes + 3 * i;
+        for (int c = 0; c < 3; c++) {
+            sizes[3 * i + c] = size[c];
+            resized = resized || size[c] != shapes->sizes[3 * i + c];
+        }
+        radii[i] = shapes->hulls[i] ? shapes->radii[i] : bounding_radius(shapes->kinds[i], size);
         fastest = fmax(fastest, x[3] * x[3] + x[4] * x[4] + x[5] * x[5]);
     }
     *placed = *shapes;
@@ -360,6 +363,8 @@ int64_t track_obstacles(int64_t n, int64_t s, double dt, double q, double *block
     placed->rates = rates;
     placed->covariances = covariances;
     placed->stamps = stamps;
-    stamps[n] = fastest;
-    return 0;
+    placed->sizes = sizes;
+    placed->radii = radii;
+    radii[n] = fastest;
+    return resized;
 }

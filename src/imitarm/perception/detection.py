@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import Pose
-from imitarm.scene import Capsule, ConvexHull, HalfSpace, Obstacle, Sphere
-from imitarm.scene.obstacle import PosedObstacle, Solid
+from imitarm.scene import HalfSpace, Obstacle
+from imitarm.scene.obstacle import Solid
 from imitarm.validation import finite_array, instance, text
 
 Array = NDArray[np.float64]
@@ -94,28 +93,6 @@ class Detection:
         return self is other or (
             self.solid.kind == other.solid.kind and self.label == other.label and bool((self.row == other.row).all())
         )
-
-
-def resized(obstacle: Obstacle, size: Array) -> Obstacle:
-    """Return ``obstacle`` with a new size, at the same pose.
-
-    Args:
-        obstacle: obstacle to resize; a convex hull is returned unchanged, because it has no size parameters.
-        size: new size, as :class:`~imitarm.scene.distances.PackedObstacles` defines it for this shape, shape (3,) [m].
-    """
-    if isinstance(obstacle, Sphere):
-        return replace(obstacle, radius=float(size[0]))
-    if isinstance(obstacle, Capsule):
-        middle, axis = 0.5 * (obstacle.start + obstacle.end), obstacle.end - obstacle.start
-        length = float(np.linalg.norm(axis))
-        half = 0.5 * float(size[1]) / length * axis if length > 0.0 else 0.5 * axis
-        return replace(obstacle, start=middle - half, end=middle + half, radius=float(size[0]))
-    if isinstance(obstacle, ConvexHull) or not isinstance(obstacle, PosedObstacle):
-        return obstacle
-    names = obstacle.lengths
-    values = [np.array(size)] if len(names) == 1 else [float(value) for value in size]
-    changes: dict[str, Any] = dict(zip(names, values, strict=False))
-    return replace(obstacle, **changes)
 
 
 def estimated(obstacle: Obstacle, covariance: Array, track_id: int, name: str) -> Obstacle:

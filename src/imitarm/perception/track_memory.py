@@ -18,11 +18,11 @@ from imitarm.scene.packed_record import RECORD_WORDS, placed_by, record_of
 
 Array = NDArray[np.float64]
 
-ALL_SEEN, IN_ORDER, RESIZED = 1, 2, 4
-"""Flags of :func:`updated`; the last two are set only together with the first.
+ALL_SEEN, IN_ORDER = 1, 2
+"""Flags of :func:`updated`; the second is set only together with the first.
 
 ``ALL_SEEN``: every track is confirmed and has one of the detections, and no detection is left. ``IN_ORDER``: detection
-i belongs to track i. ``RESIZED``: the size of a track has changed.
+i belongs to track i.
 """
 
 _SIZES, _QUATERNIONS, _COLUMNS = 3, 4, ("last_seen", "hits", "ages", "counts", "ids", "distances", "detected")
@@ -156,12 +156,12 @@ def obstacles(memory: TrackMemory, dt: float, noise: float, shapes: PackedObstac
         memory: the tracks.
         dt: time from the states of the tracks [s].
         noise: spectral density of the process noise.
-        shapes: the same obstacles at any time.
+        shapes: the same obstacles at any time; their sizes may differ.
     """
     kernel, (n, s, block) = library(), memory
     if kernel is None or dt < 0.0:
         return None
     record, _ = record_of(shapes)
-    placed = Block(np.empty(RECORD_WORDS + 19 * n + 1))
-    kernel.track_obstacles(n, s, dt, noise, block.address, record.address, placed.address)
-    return placed_by(shapes, placed, memory.array("quaternions"), block)
+    placed = Block(np.empty(RECORD_WORDS + 23 * n + 1))
+    resized = kernel.track_obstacles(n, s, dt, noise, block.address, record.address, placed.address)
+    return placed_by(shapes, placed, memory.array("quaternions"), bool(resized), block)

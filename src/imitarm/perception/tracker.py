@@ -17,7 +17,7 @@ from imitarm.perception.consistency import Consistency, chi_square_quantile
 from imitarm.perception.detection import Detection
 from imitarm.perception.motion_filter import Belief, Measurements, MotionFilter
 from imitarm.perception.rotation_rate import Rates, turned, turned_on
-from imitarm.perception.track_memory import ALL_SEEN, IN_ORDER, RESIZED, TrackMemory, obstacles, renewed, updated
+from imitarm.perception.track_memory import ALL_SEEN, IN_ORDER, TrackMemory, obstacles, renewed, updated
 from imitarm.perception.tracks import UNCONFIRMED, TrackedObstacle, Tracks, smoothed_sizes
 from imitarm.scene import Obstacle, Scene
 from imitarm.validation import finite_number, instance, sequence, whole_number
@@ -224,7 +224,10 @@ class ObstacleTracker:
         rotations = turned_on(tracks.quaternions(rows), rates, time - last_seen)
         position, velocity = np.ascontiguousarray(mean[:, :3]), np.ascontiguousarray(mean[:, 3:6])
         uncertainty = np.ascontiguousarray(covariance[:, :3, :3])
-        moved = base.packed.placed(position, rotations, velocity, rates, last_seen, uncertainty)
+        rigid = [polytope is not None for polytope in base.packed.polytopes]
+        sizes = np.where(np.array(rigid)[:, None], base.packed.sizes, tracks.sizes[rows])
+        poses = position, rotations, velocity, rates, last_seen, uncertainty
+        moved = base.packed.placed(*poses, None if (sizes == base.packed.sizes).all() else sizes)
         return Scene.predicted(base, moved, time)
 
     def _repeats(self, stamp: float, detections: tuple[Detection, ...]) -> bool:
@@ -317,7 +320,7 @@ class ObstacleTracker:
             if outlines == tracks.outlines and "" not in outlines:
                 rates = self._turned(tracks, stamp, np.arange(len(ordered)), ordered)
                 now = tracks.in_memory(memory, stamp, ordered, rates)
-                if not flags & RESIZED and "form" in tracks.__dict__:
+                if "form" in tracks.__dict__:
                     now.__dict__["form"] = tracks.form
                 return _Step(stamp, detections, now, memory.array("distances"))
         index, labels = memory.array("detected"), tracks.labels

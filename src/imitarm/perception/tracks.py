@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from imitarm.html_table import html_table
-from imitarm.perception.detection import Detection, estimated, resized
+from imitarm.perception.detection import Detection, estimated
 from imitarm.perception.motion_filter import Belief, MotionFilter
 from imitarm.perception.rotation_rate import Rates, turned_on
 from imitarm.perception.track_memory import TrackMemory
 from imitarm.scene import Obstacle
+from imitarm.scene.distances import resized
 from imitarm.validation import finite_number
 
 Array = NDArray[np.float64]
@@ -141,7 +142,7 @@ class Tracks:
 
     @cached_property
     def form(self) -> tuple[object, ...]:
-        """What does not change while the confirmed tracks only move: number, name, shape and size of each of them."""
+        """What does not change while the confirmed tracks only move or change size: number, name and kind of each."""
         return self.shapes(np.array(self.order, dtype=np.intp))
 
     @classmethod
@@ -203,8 +204,8 @@ class Tracks:
         return self.belief.combined()
 
     def shapes(self, rows: Indices) -> tuple[object, ...]:
-        """Return number, name, shape and size of each track; equal results mean that the tracks have only moved."""
-        parts: list[object] = [self.sizes[rows].tobytes()]
+        """Return number, name and kind of each track; equal results mean that tracks only move or change size."""
+        parts: list[object] = []
         for row, track_id in zip(rows.tolist(), self.ids[rows].tolist(), strict=True):
             detection = self.detections[row]
             parts += (

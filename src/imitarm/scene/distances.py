@@ -7,19 +7,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import quaternion_exp, quaternion_multiply, quaternion_to_matrix
-from imitarm.scene.convex_hull import Polytope
+from imitarm.scene.convex_hull import ConvexHull, Polytope
 from imitarm.scene.edged import CONES, DEPTH, SLABS
-from imitarm.scene.obstacle import Formula, Obstacle, Parameters
-from imitarm.scene.rounded import ELLIPSOIDS, ROUNDS
+from imitarm.scene.obstacle import Formula, Obstacle, Parameters, PosedObstacle
+from imitarm.scene.rounded import ELLIPSOIDS, ROUNDS, Capsule, Sphere
 from imitarm.validation import finite_array, finite_points
 
 Array = NDArray[np.float64]
@@ -38,6 +38,8 @@ _ROWS = (
     "stamps",
     "track_ids",
 )
+OF_THE_SIZE = "radii", "_sorted", "_place_of", "_kept"
+"""Attributes of packed obstacles that depend on their sizes."""
 _OF_THE_POSE = frozenset(("positions", "_frames", "_ahead", "_shapes", "_record"))
 
 
@@ -127,12 +129,13 @@ class PackedObstacles:
         angular_velocities: Array,
         stamp: float | Array,
         covariances: Array | None = None,
+        sizes: Array | None = None,
     ) -> PackedObstacles:
         """Return the same obstacles at other poses.
 
         ``stamp`` [s] is the time at which the obstacles were seen: one number, or one for each obstacle, shape (n,).
-        The other arguments replace the attributes of the same names; if ``covariances`` is None, the covariances are
-        kept.
+        The other arguments replace the attributes of the same names. If ``covariances`` or ``sizes`` is None, the
+        covariances or the sizes are kept.
         """
         moved = self.copy(
             positions=positions,
@@ -142,7 +145,11 @@ class PackedObstacles:
             stamps=np.full(len(self), stamp),
             covariances=self.covariances if covariances is None else covariances,
         )
-        for name in ("still", "rotating", "fastest"):
+        stale: tuple[str, ...] = ("still", "rotating", "fastest")
+        if sizes is not None:
+            moved.__dict__["sizes"] = sizes
+            stale += OF_THE_SIZE
+        for name in stale:
             moved.__dict__.pop(name, None)
         return moved
 
@@ -423,3 +430,25 @@ def _bounding_radius(kind: str, size: list[float], polytope: Polytope | None) ->
     if kind == "capsule":
         return a + 0.5 * b
     return max(a, b, c) if kind in {"sphere", "ellipsoid"} else math.hypot(a, 0.5 * b)  # else a cylinder or a cone
+
+
+def resized(obstacle: Obstacle, size: Array) -> Obstacle:
+    """Return ``obstacle`` with a new size, at the same pose.
+
+    Args:
+        obstacle: obstacle to resize; a convex hull is returned unchanged, because it has no size parameters.
+        size: new size, as :class:`PackedObstacles` defines it for this shape, shape (3,) [m].
+    """
+    if isinstance(obstacle, Sphere):
+        return replace(obstacle, radius=float(size[0]))
+    if isinstance(obstacle, Capsule):
+        middle, axis = 0.5 * (obstacle.start + obstacle.end), obstacle.end - obstacle.start
+        length = float(np.linalg.norm(axis))
+        half = 0.5 * float(size[1]) / length * axis if length > 0.0 else 0.5 * axis
+        return replace(obstacle, start=middle - half, end=middle + half, radius=float(size[0]))
+    if isinstance(obstacle, ConvexHull) or not isinstance(obstacle, PosedObstacle):
+        return obstacle
+    names = obstacle.lengths
+    values = [np.array(size)] if len(names) == 1 else [float(value) for value in size]
+    changes: dict[str, Any] = dict(zip(names, values, strict=False))
+    return replace(obstacle, **changes)

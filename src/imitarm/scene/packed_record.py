@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from imitarm.compiled.kernels import Block, Record
 from imitarm.scene.convex_hull import Polytope
-from imitarm.scene.distances import PackedObstacles
+from imitarm.scene.distances import OF_THE_SIZE, PackedObstacles
 
 Array = NDArray[np.float64]
 
@@ -32,19 +32,23 @@ def record_of(packed: PackedObstacles) -> tuple[Record, float]:
     return known
 
 
-def placed_by(shapes: PackedObstacles, block: Block, quaternions: Array, *kept: object) -> PackedObstacles:
+def placed_by(
+    shapes: PackedObstacles, block: Block, quaternions: Array, resized: bool, *kept: object
+) -> PackedObstacles:
     """Return obstacles whose poses ``track_obstacles`` in ``compiled/tracks.c`` has computed; they do not rotate.
 
     Args:
         shapes: the same n obstacles at another time.
         block: memory with the C structure ``Obstacles``, followed by positions, velocities and angular velocities (n, 3
-            each), covariances (n, 3, 3), times of the last detections (n), and the square of the largest speed (1).
+            each), covariances (n, 3, 3), times of the last detections (n), sizes (n, 3), radii (n), and the square of
+            the largest speed (1).
         quaternions: rotations, shape (n, 4).
+        resized: whether a size is not that of ``shapes``.
         kept: objects that own other memory to which the structure points; the result keeps them alive.
     """
     n, words, a = len(shapes), block.array, RECORD_WORDS
     fastest = math.sqrt(words.item(-1))
-    return shapes.copy(
+    placed = shapes.copy(
         positions=words[a : a + 3 * n].reshape(n, 3),
         quaternions=quaternions,
         velocities=words[a + 3 * n : a + 6 * n].reshape(n, 3),
@@ -56,6 +60,11 @@ def placed_by(shapes: PackedObstacles, block: Block, quaternions: Array, *kept: 
         fastest=fastest,
         _record=(Record.at(block.address, block, shapes, *kept), 0.0),
     )
+    if resized:
+        for name in OF_THE_SIZE:
+            placed.__dict__.pop(name, None)
+        placed.__dict__["sizes"] = words[a + 19 * n : a + 22 * n].reshape(n, 3)
+    return placed
 
 
 def _built(packed: PackedObstacles) -> Record:

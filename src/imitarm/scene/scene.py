@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from imitarm.errors import InputError
 from imitarm.html_table import html_table
 from imitarm.kinematics.pose import Pose
-from imitarm.scene.distances import PackedObstacles, distances, distances_and_gradients
+from imitarm.scene.distances import PackedObstacles, distances, distances_and_gradients, resized
 from imitarm.scene.obstacle import Array, Obstacle
 from imitarm.validation import finite_number, finite_points, whole_number
 
@@ -126,8 +126,11 @@ class Scene:
         if name != "obstacles" or seen is None:
             raise AttributeError(f"Scene has no attribute {name!r}")
         packed = self.packed
+        shapes = seen.obstacles
+        if packed.sizes is not seen.packed.sizes:
+            shapes = tuple(resized(obstacle, size) for obstacle, size in zip(shapes, packed.sizes, strict=True))
         rows = zip(
-            seen.obstacles,
+            shapes,
             packed.positions,
             packed.quaternions,
             packed.velocities,
