@@ -45,7 +45,7 @@ The exit status is 1 if a scene fails or the arm touches an obstacle.
 
 DEMO_SCENES = ("free", "two_boxes", "tall_and_low", "boxes_and_cone", "cone_first", *MOVING_SCENES)
 
-_MAX_ACCELERATION = 9.0  # [m/s^2] of the Sawyer's brush; more would tilt the brush until it touches the table
+_MAX_ACCELERATION = 7.0  # [m/s^2] of the Sawyer's brush; more would tilt the brush until it touches the table
 
 _SUMMARY = (
     "A Sawyer learns from eight demonstrations to sweep crumbs into a dustpan. The Sawyer then sweeps "
