@@ -77,9 +77,14 @@ VARIANTS: Mapping[str, Method] = {
     "m1-scaled": Method("m1", "M1, scaled", {"velocity_scaling": True}),
     "m3-scaled": Method("m3", "M3, scaled", {"velocity_scaling": True}),
 }
-"""Methods with changed options, which show the effects of the options. "Me-thesis" fits one NURBS curve to the whole
-recording and uses the small-angle term of the thesis. "as printed" keeps the misprints of the thesis that still give a
-program that runs. "scaled" slows all joints down by a common factor when one joint would be too fast."""
+"""Methods with changed options, which show the effects of the options:
+
+* "Me-thesis" fits one NURBS curve to the whole recording and uses the small-angle term of the thesis.
+* "global" fits one NURBS curve to the whole recording.
+* "small angle" uses the small-angle term of the thesis.
+* "as printed" keeps the misprints of the thesis, except those with which the program could not run.
+* "scaled" slows all joints down by a common factor when one joint would be too fast.
+"""
 
 METHODS: Mapping[str, Method] = {**MAIN, **VARIANTS}
 """All methods by name."""

@@ -200,10 +200,10 @@ def claims_table(results: Results, tasks: Sequence[str]) -> Table:
     columns = ("the thesis claims", "thesis, corrected", "held?", "modern", "held?")
     note = (
         "A percentage is the difference between the method of the column and the baseline, relative to the baseline. "
-        'A difference counts if its 95 % interval excludes zero and its corrected p-value is below 0.05. "Yes": for '
-        'every baseline, the difference counts and has the claimed sign. "No": for at least one baseline, the '
-        'difference counts and has the opposite sign. "Not shown": all other cases. Times are compared only in trials '
-        "in which the method and the baseline both succeeded."
+        "A difference counts if its 95 % interval excludes zero and its corrected p-value is below 0.05. The result "
+        'is "yes" if the differences from all baselines count and have the claimed sign. The result is "no" if at '
+        'least one difference counts and has the opposite sign. All other results are "not shown". Times are compared '
+        "only in trials in which the method and the baseline both succeeded."
     )
     return Table("Claims of the thesis, and results", columns, tuple(rows), note)
 

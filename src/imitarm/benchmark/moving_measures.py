@@ -22,10 +22,16 @@ Array = NDArray[np.float64]
 PER_PERIOD = 2
 """Number of instants per control period at which the true distance to the obstacles is computed."""
 OUTCOMES = ("success", "too near", "contact", "missed goal", "late", "refused", "failed")
-"""Possible outcomes. "success": the tool touched nothing and reached the goal. "too near": the same, but the tool came
-nearer to an obstacle than required. "contact": the tool touched an obstacle. "missed goal": the policy ended the motion
-elsewhere. "late": the tool had not arrived after twice the learned duration. "refused": the policy refused the task
-before any motion. "failed": the method raised an error."""
+"""Possible outcomes of a run:
+
+* "success": the tool touched nothing and reached the goal.
+* "too near": the same, but the tool came nearer to an obstacle than required.
+* "contact": the tool touched an obstacle.
+* "missed goal": the policy ended the motion away from the goal.
+* "late": the tool had not arrived after twice the learned duration.
+* "refused": the policy refused the task before any motion.
+* "failed": the method raised an error.
+"""
 SUCCESSES = OUTCOMES[:2]
 """Outcomes that count as a success. The simulation itself limits the speed and the acceleration of the tool."""
 _STALLED = 0.02  # [m/s] a tool slower than this stands
@@ -69,9 +75,9 @@ def measured(case: MovingCase, run: ToolRun) -> tuple[str, str, dict[str, Any]]:
         * ``goal_error``: distance from the goal at the end [m];
         * ``duration``, ``duration_ratio``: duration of the motion [s], and this duration divided by the learned
           duration;
-        * ``rmse``: root mean square distance between the motion and the learned motion at equal times [m]; after the
-          end of the learned motion, the distance from the goal is used;
-        * ``rmse_unaffected``: like ``rmse``, but only over the samples at which the tool on the learned path is farther
+        * ``rmse``: root mean square distance between the motion and the learned motion at equal times [m]. After its
+          end, the learned motion stays at the goal.
+        * ``rmse_unaffected``: like ``rmse``, but only at times at which a tool on the learned path would be farther
           than 10 cm from every obstacle [m];
         * ``path_rmse``: root mean square distance from the nearest point of the learned path [m], so delays do not
           count;

@@ -92,7 +92,7 @@ class _Placed(NamedTuple):
 
 
 class _Draw(NamedTuple):
-    """What a scene is drawn from."""
+    """Input of the functions that place obstacles: random numbers, and the learned path."""
 
     rng: np.random.Generator
     path: Trajectory

@@ -33,9 +33,14 @@ Array = NDArray[np.float64]
 
 SHAPES = ("sphere", "box", "cylinder", "capsule", "cone", "ellipsoid", "convex hull")
 FAMILIES = ("one object", "held bottle", "in contact", "half hidden", "empty")
-"""Families of scenes. "one object": an object of any shape, which stands on the table or floats. "held bottle": a
-bottle, and the forearm and hand that hold it. "in contact": two objects that touch each other. "half hidden": an object
-that another object hides about half from the camera. "empty": no object."""
+"""Families of scenes:
+
+* "one object": an object of any shape stands on the table or floats.
+* "held bottle": a hand with its forearm holds a bottle.
+* "in contact": two objects touch each other.
+* "half hidden": an object hides about half of another object from the camera.
+* "empty": there is no object.
+"""
 DISTANCES = (1.0, 2.0, 3.0)
 """Distances of the camera from the middle of the table [m]."""
 MOST = 10_000  # seeds of one family

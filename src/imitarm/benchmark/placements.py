@@ -46,10 +46,15 @@ from imitarm.trajectory import Rollout, Trajectory
 Array = NDArray[np.float64]
 
 OUTCOMES = ("arrived", "refused", "waited", "too near", "touched", "stopped")
-"""Possible outcomes of a placement. "arrived": the arm reached the goal and kept the clearance. "refused": the policy
-refused the placement before any motion. "waited": the motion was not finished in time. "too near": the arm reached the
-goal, but came nearer to an obstacle than permitted. "touched": the arm touched an obstacle or itself. "stopped": a
-protective stop or another failure ended the motion."""
+"""Possible outcomes of a placement:
+
+* "arrived": the arm reached the goal and kept the clearance.
+* "refused": the policy refused the placement before any motion.
+* "waited": the motion was not finished in time.
+* "too near": the arm reached the goal, but came nearer to an obstacle than permitted.
+* "touched": the arm touched an obstacle or itself.
+* "stopped": a protective stop or another failure ended the motion.
+"""
 
 CLEARANCE = 0.02  # [m] required
 _DT = 0.01  # [s]

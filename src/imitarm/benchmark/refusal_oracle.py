@@ -2,9 +2,9 @@
 
 The oracle does not use the library's search for a path. It gives one of three answers:
 
-* **impossible**: the oracle proved that no continuous displacement of the path avoids the obstacles. Either an obstacle
-  covers a point that must not move, or every sequence of boxes in space and time from the start to the goal is blocked
-  (:mod:`imitarm.benchmark.refusal_proof`).
+* **impossible**: the oracle proved that no continuous displacement of the path avoids the obstacles. An obstacle covers
+  a point that must not move, or every sequence of boxes from the start to the goal is blocked
+  (:mod:`imitarm.benchmark.refusal_proof`). A box contains positions and times.
 * **possible**: the oracle found and verified a path. It searches in two ways. The first search looks for a sequence of
   free boxes from the start to the goal. The second search uses a grid of displacements at many times, called layers. A
   cell of the grid is free if an obstacle is far enough from its centre. A move between two cells is free if a lower

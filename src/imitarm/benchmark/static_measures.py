@@ -242,10 +242,16 @@ def outcome(case: StaticCase, found: PathMeasures) -> tuple[str, str]:
 
 
 OUTCOMES = ("success", "too near", "contact", "missed goal", "late", "limit", "refused", "failed")
-"""Possible outcomes. "success": the path meets all conditions. "too near": the same, but the path comes nearer to an
-obstacle than required. "contact": the tool touches an obstacle. "missed goal": the path misses the goal, the start or a
-contact point, or is displaced in a forbidden direction. "late": the plan takes too long. "limit": the plan takes too
-long when it is slowed down to keep the limits of speed and acceleration. "refused": the method refused the scene.
-"failed": the method raised an error."""
+"""Possible outcomes of a plan:
+
+* "success": the path meets all conditions.
+* "too near": the same, but the path comes nearer to an obstacle than required.
+* "contact": the tool touches an obstacle.
+* "missed goal": the path misses the goal, the start or a contact point, or is displaced in a forbidden direction.
+* "late": the planned motion takes too long.
+* "limit": the motion takes too long after it was slowed down to keep the limits of speed and acceleration.
+* "refused": the method refused the scene.
+* "failed": the method raised an error.
+"""
 SUCCESSES = OUTCOMES[:2]
 """Outcomes that count as a success."""

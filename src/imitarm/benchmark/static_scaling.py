@@ -137,8 +137,8 @@ def scaling_tables(
         columns = ("method", *(f"{n}>" for n in many), "exponent (standard error)>")
         note = (
             "Median processor time of a plan [ms], and in brackets the rate of success in percent with its Wilson "
-            "interval. Exponent: b of the power law time = a n^b, which is fitted to all plans of the row; n is the "
-            "number at the top of the column."
+            "interval. A power law, time = a n^b, is fitted to all plans of the row. Here n is the number at the top "
+            "of the column, and b is the exponent."
         )
         title = f"Time and success by the number of {what}, {len(seeds)} scenes for each number"
         tables.append(Table(title, columns, tuple(rows), note))

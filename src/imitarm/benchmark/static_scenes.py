@@ -1,15 +1,15 @@
 """Static scenes of ``imitarm benchmark static``. Each family of scenes has a different kind of obstacles.
 
-| family | obstacles | does the construction of the scene guarantee a solution? |
+| family | obstacles | solution, by the construction of the scene |
 |---|---|---|
 | S1 | sparse: 1 or 2 spheres and boxes on the path | yes |
-| S2 | dense: 4 to 8 spheres and boxes on and beside the path | unknown |
+| S2 | dense: 4 to 8 spheres and boxes on and beside the path | not known |
 | S3 | mixed: 1 to 3 obstacles of all shapes on the path | yes |
 | S4 | a wall with a gap, 1.2 to 3 times as wide as the tool | depends on the width of the gap |
 | S5 | a trap: three boxes in the shape of a U that opens towards the path, 5 to 20 cm deep | yes |
-| S6 | an obstacle over the start, the goal or a contact point | no solution |
-| S7 | the sweep around 2 to 4 boxes and cones: the scenes T1 to T8 with small changes | unknown |
-| S9 | reach into an open box, with 1 to 3 obstacles on the path | unknown |
+| S6 | an obstacle over the start, the goal or a contact point | no |
+| S7 | the sweep around 2 to 4 boxes and cones: the scenes T1 to T8 with small changes | not known |
+| S9 | reach into an open box, with 1 to 3 obstacles on the path | not known |
 
 The learned motion is an S-shaped reach in S1 to S6, the sweep of :class:`~imitarm.tasks.sweep.SweepTask` in S7, and the
 reach of :class:`~imitarm.tasks.open_box.OpenBoxTask` in S9. Scenes for the whole arm (S8) are in
@@ -114,7 +114,7 @@ class _Placed(NamedTuple):
 
 
 class _Draw(NamedTuple):
-    """What a scene is drawn from."""
+    """Input of the functions that place obstacles: random numbers, the learned path, and the number of obstacles."""
 
     rng: np.random.Generator
     path: Array  # (n, 3) [m]
