@@ -197,7 +197,7 @@ _TORQUES = {
 
 
 def tables(results: Results) -> list[Table]:
-    """Return every table that has results; the table on the claims of the thesis comes first."""
+    """Return all tables that have results. The table of the claims of the thesis comes first."""
     replayed, found = results.tasks(), []
     if replayed:
         stacking = results.tasks(["stacking"]) or replayed

@@ -110,7 +110,7 @@ def run_experiments(
         store: store that saves the results.
         workers: processes that run the experiments; None: one for each processor.
         fresh: whether to ignore saved results and run all experiments again.
-        on_done: function called with the progress.
+        on_done: function that is called with the progress after each experiment.
 
     Raises:
         InputError: when the backend does not exist.

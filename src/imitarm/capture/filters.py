@@ -295,8 +295,8 @@ class SideFilter(SkeletonSource):
 class RealtimeSource(SkeletonSource):
     """Delays the skeletons of a source, so that they arrive at the pace of their time stamps.
 
-    The first call of :meth:`read` returns the first skeleton at once. Each later skeleton is returned when as much time
-    has passed as its time stamp is later than that of the first skeleton.
+    The first call of :meth:`read` returns the first skeleton at once. If the time stamp of a later skeleton is t
+    seconds after that of the first skeleton, it is returned t seconds after the first skeleton.
 
     Args:
         source: source that returns skeletons without waiting, such as a recording.
