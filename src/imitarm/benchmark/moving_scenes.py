@@ -254,7 +254,7 @@ def _manoeuvring(draw: _Draw) -> _Placed:
 
 
 def _many(draw: _Draw) -> _Placed:
-    """One obstacle aimed at the tool; the others pass near it at some time, on tracks that cross its own."""
+    """One obstacle meets the tool. All other obstacles pass near this obstacle, on paths that cross its path."""
     first = draw.aimed(30.0, 180.0)
     made = [first]
     for _ in range(int(draw.rng.integers(2, 6))):

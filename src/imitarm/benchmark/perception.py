@@ -215,7 +215,7 @@ def _extents(obstacle: Obstacle) -> Array:
 
 
 def _distance(obstacle: Obstacle, others: Iterable[Obstacle]) -> float:
-    """Return the distance from sample points of an obstacle to the nearest of the others [m]."""
+    """Return the smallest distance between sample points of an obstacle and the obstacles ``others`` [m]."""
     points = np.concatenate(_samples(obstacle))
     return min((float(other.signed_distance(points).min()) for other in others), default=np.inf)
 

@@ -310,10 +310,10 @@ class _Choice:
     """Choice of the axis along which each of n cells is divided next.
 
     Each obstacle or limit that may block a part of a cell has a *span*: how much its distance varies over the cell
-    along each axis. A cell is divided along the longest span of one obstacle or limit. Three choices of the latter take
-    turns, because each alone would divide some cells for ever without a result:
+    along each axis. A cell is divided along the longest span of one obstacle or limit. Three rules choose this obstacle
+    or limit in turn, because each rule alone would divide some cells for ever:
 
-    * the one that needs the least additional depth to block the whole cell;
+    * the obstacle or limit that needs the least additional depth to block the whole cell;
     * the one with the longest span in space;
     * the one that blocks the largest fraction of the cell.
     """

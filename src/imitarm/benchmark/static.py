@@ -253,7 +253,7 @@ _warm: set[tuple[str, int]] = set()  # method, and identity of the skill
 
 
 def _warm_up(method: str, case: StaticCase) -> None:
-    """Let a method plan once without a clock in each process and for each skill, which imports and caches its parts."""
+    """Plan once without timing, in each process and for each skill, so that imports and caches are not timed later."""
     key = (method, id(case.skill))  # skills are kept, see learned_skill and saved_skill
     if key in _warm or method in CONTROLS:
         return
