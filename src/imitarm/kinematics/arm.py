@@ -87,6 +87,7 @@ class ArmModel(ArmKinematics):
     Attributes:
         name: for example ``"sawyer"``.
         joint_names: names of the joints from base to flange, without the joints of a gripper.
+        n_joints: number of these joints.
         lower: lower limits of the joint positions, shape (n_joints,) [rad]; -inf where there is no limit.
         upper: upper limits of the joint positions, shape (n_joints,) [rad]; inf where there is no limit.
         max_velocity: largest joint speeds, shape (n_joints,) [rad/s].

@@ -153,10 +153,15 @@ class ArmMemory:
 
 
 class ArmKinematics:
-    """How the joints of an arm move its flange, its tool and its links; base class of :class:`~imitarm.ArmModel`."""
+    """How the joints of an arm move its flange, its tool and its links; base class of :class:`~imitarm.ArmModel`.
+
+    Attributes:
+        n_joints: number of joints from base to flange.
+    """
 
     name: str
     joint_names: tuple[str, ...]
+    n_joints: int
     landmarks: Landmarks | None
 
     def __init__(self, name: str, joint_names: tuple[str, ...], model: mujoco.MjModel, posture: Array) -> None:
@@ -169,7 +174,7 @@ class ArmKinematics:
             posture: positions of all joints of the model, including fingers, shape (nq,).
         """
         joints = [model.joint(joint).id for joint in joint_names]
-        self.name, self.joint_names = name, joint_names
+        self.name, self.joint_names, self.n_joints = name, joint_names, len(joint_names)
         self.landmarks = Landmarks.find(model, np.array(joints))
         self._model, self._posture, self._shape = model, posture, (len(joints),)
         self._qpos = _columns(model.jnt_qposadr[joints])
@@ -178,11 +183,6 @@ class ArmKinematics:
         sites = [model.site(i).name for i in range(model.nsite)]
         self._tool = sites.index("tool") if "tool" in sites else self._flange
         self._local = threading.local()
-
-    @property
-    def n_joints(self) -> int:
-        """Number of joints from base to flange."""
-        return len(self.joint_names)
 
     @property
     def has_tool(self) -> bool:

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 
 from imitarm.command import Command, Status
 from imitarm.compiled import library
-from imitarm.compiled.kernels import Record, address
+from imitarm.compiled.kernels import Block, Record, address
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import (
     Pose,
@@ -145,12 +145,13 @@ class RCAMO(Policy):
             times, self.gains, self._tau, obstacle_cost, push, headings(self._axes), max_acceleration=limit
         )
         self._dmp, self._precision = _primitive(skill, self.gains), learned_precision(skill)
-        self._steps: dict[float, Response] = {}
+        self._steps: dict[float, tuple[Array, Array]] = {}  # by dt: how the deviation and its rate change
+        self._stiffness = np.array([self.gains.stiffness / self._tau**2, self.gains.damping / self._tau])
         self._path: PrimitivePath | None = None
         self._learned_goal = skill.goal_
         self._known: tuple[Pose | None, PrimitivePath | None] = None, None  # a goal, and the motion to it
         self._path_record: tuple[PrimitivePath, Array, Record] | None = None
-        self._room_for, self._room, self._state, self._out = -1, np.zeros(0), np.zeros(30), np.zeros(6)
+        self._room_for, self._room, self._state, self._out = -1, *(Block(np.zeros(n)) for n in (1, 30, 6))
 
     # ----- start
 
@@ -224,7 +225,7 @@ class RCAMO(Policy):
         x = observation.tool_to_base.position
         reference = path.position(self._phase) + self._deviation[0]
         lag = x - reference
-        away = float(np.sqrt(lag.dot(lag)))
+        away = math.sqrt(lag.dot(lag))
         if away > self._patience:
             shift = lag * (1.0 - self._patience / away)
             self._deviation[0] += shift
@@ -241,18 +242,18 @@ class RCAMO(Policy):
 
     def _advance(self, rate: float, push: Array, dt: float) -> float:
         """Advance phase and deviation by ``dt``; return the phase before."""
-        one = self._steps.get(dt)
-        if one is None:
-            one = self._steps[dt] = Response.of(self.gains, self._tau, np.array([dt]))
+        matrices = self._steps.get(dt)
+        if matrices is None:
+            A, B, G, a, b, g = Response.of(self.gains, self._tau, np.array([dt]))
+            matrices = self._steps[dt] = np.column_stack(([*A, *a], [*B, *b])), np.array([G, g])
         before = self._phase
         decay = math.exp(-dt / _RATE_TIME)
         travelled = rate * dt + (self._rate - rate) * _RATE_TIME * (1.0 - decay)
         self._phase = min(max(self._phase + travelled / self._dmp.duration_, 0.0), 1.0)
         self._rate = rate + (self._rate - rate) * decay
-        e, v = self._deviation
-        self._deviation = np.empty((2, 3))
-        self._deviation[0] = one.A * e + one.B * v + one.G * push
-        self._deviation[1] = one.a_rate * e + one.b_rate * v + one.g_rate * push
+        by_itself, by_push = matrices
+        self._deviation = by_itself.dot(self._deviation)
+        self._deviation += by_push * push
         return before
 
     def _phases(self, rates: Array, times: Array) -> Array:
@@ -280,8 +281,8 @@ class RCAMO(Policy):
         (obstacles, dt), constants = record_of(packed), self._record.address
         if self._room_for < len(packed):
             self._room_for = len(packed)
-            self._room = np.empty(kernel.least_cost_scratch(constants, len(packed)))
-        elapsed, state, margins = observation.time - observation.scene.stamp, self._state, None
+            self._room = Block(np.empty(kernel.least_cost_scratch(constants, len(packed))))
+        elapsed, state, margins = observation.time - observation.scene.stamp, self._state.array, None
         if self._margin is not None:
             margins = np.ascontiguousarray(self._margins(packed, elapsed))
         axes = frame(path.tangent(self._phase), self._axes)
@@ -289,17 +290,16 @@ class RCAMO(Policy):
         state[12:15], state[15:18] = self._scaled, self._spring() / self.least_cost.max_push
         state[18:21] = self._phase, self._rate, elapsed
         state[21 : 21 + axes.size] = axes.ravel()
-        places = constants, path_record[2].address, address(state), None if margins is None else address(margins)
-        nearest = kernel.least_cost_choice(obstacles.address, dt, *places, address(self._room), address(self._out))
+        places = constants, path_record[2].address, self._state.address, None if margins is None else address(margins)
+        nearest = kernel.least_cost_choice(obstacles.address, dt, *places, self._room.address, self._out.address)
         if nearest < 0:
             return STAY
-        x, y, z, rate, cost, gap = self._out.tolist()
+        x, y, z, rate, cost, gap = self._out.array.tolist()
         return Choice(np.array([x, y, z]), rate, cost, nearest, gap)
 
     def _spring(self) -> Array:
         """Return the acceleration of spring and damper, against the deviation, shape (3,) [m/s^2]."""
-        e, v = self._deviation
-        return np.asarray((self.gains.stiffness / self._tau**2) * e + (self.gains.damping / self._tau) * v)
+        return self._stiffness.dot(self._deviation)
 
     def _choose_by_numpy(self, path: PrimitivePath, lag: Array, near: _Near) -> Choice:
         least_cost, times = self.least_cost, self.least_cost.times
@@ -373,14 +373,14 @@ class RCAMO(Policy):
         else:
             forward = quaternion_log(quaternion_multiply(after, quaternion_conjugate(before))) / dt
         error = self._gain * tool.error_to(Pose.trusted(tool.position, before))[3:]
-        size = float(np.sqrt(error.dot(error)))
+        size = math.sqrt(error.dot(error))
         return forward + (error * (_FASTEST_TURN / size) if size > _FASTEST_TURN else error)
 
     def _command(self, twist: Array, observation: Observation, chosen: Choice, lag: float) -> Command:
         if chosen.nearest >= 0:
             name = observation.scene.name_of(chosen.nearest)
             self._reason = f"{name}, predicted to come within {1e3 * chosen.gap:.0f} mm of the tool"
-        deviation = float(np.sqrt(self._deviation[0].dot(self._deviation[0])))
+        deviation = math.sqrt(self._deviation[0].dot(self._deviation[0]))
         waits = self._rate < _STANDS and self._phase < 1.0
         if waits and chosen.rate < _STANDS:
             reason = f"the motion waits because of {self._reason}"
