@@ -47,7 +47,9 @@ def test_every_period_is_counted_and_nothing_is_touched(measured):
     assert measured.control["skipped"] <= measured.missed <= measured.periods
     assert measured.contacts == [] and measured.simulation["clearance"] > 0.0
     assert measured.simulation["accepted"] > 0
-    assert measured.camera["images"] >= measured.tracker["updates"] > 0
+    assert 0 <= measured.simulation["missed"] < measured.simulation["periods"]
+    assert len(measured.camera["seconds"]) == measured.camera["images"]
+    assert len(measured.tracker["seconds"]) == measured.tracker["updates"]
     assert sum(motion["steps"] for motion in measured.control["motions"]) == n
 
 
@@ -162,8 +164,11 @@ def test_a_shared_state_is_read_as_it_was_written():
     np.testing.assert_array_equal(read_q, q)
     assert not shared.started and not shared.stopping
     shared.start()
-    assert shared.started and not shared.stopping
+    assert shared.started and not shared.measuring
+    shared.measure()
+    assert shared.started and shared.measuring and not shared.stopping
     shared.stop()
+    shared.measure()
     shared.start()
     assert shared.stopping
 

@@ -47,7 +47,7 @@ _END_TIME = 5.0  # [s] in which a process must end by itself
 _OTHERS = 0.5  # [s] after the first failure, in which the process that caused the failure becomes known
 _LOST = "lost the connection to another process"
 
-_RUNNING, _STOPPING = 1.0, 2.0
+_RUNNING, _MEASURING, _STOPPING = 1.0, 2.0, 3.0
 _PHASE, _SCENES, _VERSION, _TIME, _Q = range(5)  # places in the shared memory
 
 
@@ -69,6 +69,11 @@ class Shared:
         if not self.stopping:
             self._values[_PHASE] = _RUNNING
 
+    def measure(self) -> None:
+        """Let all processes begin to count; what happened before is not measured."""
+        if not self.stopping:
+            self._values[_PHASE] = _MEASURING
+
     def stop(self) -> None:
         """Let all processes end."""
         self._values[_PHASE] = _STOPPING
@@ -77,6 +82,11 @@ class Shared:
     def started(self) -> bool:
         """Whether the camera may take images."""
         return bool(self._values[_PHASE] >= _RUNNING)
+
+    @property
+    def measuring(self) -> bool:
+        """Whether the measurement has begun."""
+        return bool(self._values[_PHASE] >= _MEASURING)
 
     @property
     def stopping(self) -> bool:

@@ -1,4 +1,4 @@
-"""The control process of the real-time benchmark: the arm sweeps forth and back, and every period is timed."""
+"""The control process of the real-time benchmark: the arm sweeps back and forth, and every period is timed."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ class TimedLoop:
 
 
 def control(setup: RealTimeSetup, shared: Shared, simulation: Connection, scenes: Connection) -> dict[str, Any]:
-    """Let the arm sweep forth and back until the duration is over, and return the measured times.
+    """Let the arm sweep back and forth until the duration is over, and return the measured times.
 
     Args:
         setup: what is measured.
@@ -211,6 +211,7 @@ def control(setup: RealTimeSetup, shared: Shared, simulation: Connection, scenes
         loop.clear(round(_WARM_UP * setup.rate))
         _move(setup, arm, policies[0], robot, loop)
         loop.clear(round(setup.duration * setup.rate))
+        shared.measure()
         motions = []
         for policy in itertools.cycle(policies):
             if loop.over():

@@ -48,12 +48,15 @@ def simulate(setup: RealTimeSetup, shared: Shared, control: Connection) -> dict[
     arm = setup.arm()
     robot = setup.simulated(arm, control.recv())
     gaps: list[float] = []
+    before: list[int] = []  # number of periods and of missed periods when the measurement began
     every = max(round(_MEASURE_EVERY * setup.rate), 1)
 
     def on_step(server: RobotServer) -> None:
         shared.publish(robot.time, robot.state().q)
         if server.rate_limiter.ticks % every == 0:
             gaps.append(robot.clearance())
+        if not before and shared.measuring:
+            before.extend((server.rate_limiter.ticks, server.rate_limiter.overruns))
         if shared.stopping:
             raise _Stopped
 
@@ -64,9 +67,10 @@ def simulate(setup: RealTimeSetup, shared: Shared, control: Connection) -> dict[
             server.run(on_step=on_step)
         accepted = server.supervisor.datagram_filter.accepted
         dropped = server.supervisor.datagram_filter.dropped + server.supervisor.dropped
+    ticks, overruns = before or (server.rate_limiter.ticks, server.rate_limiter.overruns)
     return {
-        "periods": server.rate_limiter.ticks,
-        "missed": server.rate_limiter.overruns,
+        "periods": server.rate_limiter.ticks - ticks,
+        "missed": server.rate_limiter.overruns - overruns,
         "accepted": accepted,
         "dropped": {str(reason): n for reason, n in dropped.items() if n},
         "clearance": min(gaps, default=float("inf")),
@@ -85,20 +89,23 @@ def watch(setup: RealTimeSetup, shared: Shared, tracker: Connection) -> dict[str
     robot = setup.simulated(setup.arm(), setup.arm().home)
     camera, detector = setup.camera(robot), setup.detector(robot)
     seconds: list[float] = []
+    missed = 0
     while not shared.started:
         time.sleep(0.01)
     limiter = RateLimiter(1.0 / CAMERA_RATE)
     with _until_stopped(shared):
         while not shared.stopping:
-            limiter.wait()
+            late = limiter.wait()
             began = time.perf_counter()
             simulated, q = shared.state(robot.arm.n_joints)
             robot.show(q, simulated)
             frame = camera.frame()
             found = detector.detect(frame, q)
             tracker.send((frame.stamp, found))
-            seconds.append(time.perf_counter() - began)
-    return {"images": len(seconds), "missed": limiter.overruns, "seconds": seconds}
+            if shared.measuring:
+                missed += late
+                seconds.append(time.perf_counter() - began)
+    return {"images": len(seconds), "missed": missed, "seconds": seconds}
 
 
 def track(setup: RealTimeSetup, shared: Shared, camera: Connection, control: Connection) -> dict[str, Any]:
@@ -119,7 +126,8 @@ def track(setup: RealTimeSetup, shared: Shared, camera: Connection, control: Con
             tracker.update(stamp, found)
             control.send((stamp, tracker.scene(stamp).obstacles))
             shared.scenes += 1
-            seconds.append(time.perf_counter() - began)
+            if shared.measuring:
+                seconds.append(time.perf_counter() - began)
     return {"updates": len(seconds), "seconds": seconds}
 
 

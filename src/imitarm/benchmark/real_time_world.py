@@ -1,4 +1,4 @@
-"""The world of the real-time benchmark: an arm that sweeps forth and back, moving obstacles, and a depth camera."""
+"""The world of the real-time benchmark: an arm that sweeps back and forth, moving obstacles, and a depth camera."""
 
 from __future__ import annotations
 
