@@ -152,8 +152,8 @@ def test_a_certificate_that_needs_a_schedule_is_void_when_the_motion_stops(sweep
     arguments = ["--tool", "brush", "--scene", str(scene), "--report", str(report)]
     assert main(["reproduce", str(sweep), *arguments]) == 1
     text = " ".join(capsys.readouterr().out.split())
-    assert "void" in text and "on schedule, but the motion did not finish" in text, text
-    assert "on schedule, but the motion did not finish" in report.read_text()
+    assert "void" in text and "on schedule; the motion did not finish" in text, text
+    assert "on schedule; the motion did not finish" in report.read_text()
 
 
 def test_tilts_concern_the_plan_of_the_whole_arm(sweep, capsys):
