@@ -25,7 +25,7 @@ _ITEM = r"\s*(?:[-*]\s|\d+\.\s|#+\s|\||>|!\["
 _START = re.compile(_ITEM + ")")
 _ARGUMENT = re.compile(_ITEM + r"|[\w*, ().]+:$|\w[\w, *]*(?: \([^)]*\))?: )")
 _END = re.compile(r"(?<=[.!?])[\"')*]*\s+(?=[\"'(*`$\[]*[A-Z0-9])")
-_BEFORE, _AFTER = 6, 4  # lines that ``--context`` prints before the line of a sentence and after it
+_BEFORE, _AFTER = 14, 8  # lines that ``--context`` prints before the line of a sentence and after it
 _ABBREVIATION = re.compile(r"\b(?:Eq|Eqs|Fig|Figs|e\.g|i\.e|et al|vs|cf|Trans|No|[A-Z])\.$")
 _WORD = re.compile(r"(?<![\w\\])[A-Za-z]{2,}(?!\w)")
 _REGULAR = re.compile(r"\(\?:|\[\^|\\[wd](?![A-Za-z])|\\\d")  # a string that is a regular expression

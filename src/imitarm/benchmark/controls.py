@@ -1,4 +1,4 @@
-"""Controls of the avoidance benchmark: methods with a known result show whether the benchmark measures correctly.
+"""Methods that check the static benchmark: their results are known, so they show whether it measures correctly.
 
 * ``no-avoidance`` follows the learned path. If this method succeeded, the obstacles would not block the learned path.
 * ``aims-at-obstacle`` steers through the middle of the nearest obstacle. If this method ever succeeded, the benchmark
@@ -136,4 +136,4 @@ CONTROLS: dict[str, type[PathPolicy]] = {
     "aims-at-obstacle": AimsAtObstacle,
     "oracle": Oracle,
 }
-"""The controls by name."""
+"""The methods that check the benchmark, by name."""

@@ -37,7 +37,7 @@ _PLAN_ONCE = ("elastic-band", "tp-gmm")  # the first plans once; the second diff
 
 
 def method_names(world: str = "tool") -> tuple[str, ...]:
-    """Return the names of all methods that can run in a world: controls and policies."""
+    """Return the names of all methods that can run in a world; first come the methods that check the benchmark."""
     if world == "tool":
         return (*CONTROLS, *(name for name in POLICIES if name not in _PLAN_JOINTS))
     return (CONTROLS[0], *ORACLES, *POLICIES)

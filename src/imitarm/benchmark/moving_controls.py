@@ -1,4 +1,4 @@
-"""Controls of the moving benchmark: methods with a known result show whether the benchmark measures correctly.
+"""Methods that check the moving benchmark: their results are known, so they show whether it measures correctly.
 
 * ``no-avoidance`` follows the learned motion. If this method succeeded, the obstacles would not block the learned
   motion.
@@ -403,11 +403,11 @@ def _follow(motion: Trajectory, time: float, x: Array) -> Command:
 
 
 CONTROLS = ("no-avoidance", "aims-at-obstacle", "oracle-future", "oracle-tracks")
-"""The names of the controls."""
+"""The names of the methods that check the benchmark."""
 
 
 def control(name: str, case: MovingCase, **options: Any) -> Policy:
-    """Return the policy of a control for a scene.
+    """Return the policy of a method that checks the benchmark, for a scene.
 
     Args:
         name: one of :data:`CONTROLS`.

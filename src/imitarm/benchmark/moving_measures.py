@@ -90,7 +90,7 @@ def measured(case: MovingCase, run: ToolRun) -> tuple[str, str, dict[str, Any]]:
         * ``position_error``, ``velocity_error``: root mean square errors of the tracked obstacles [m], [m/s];
         * ``nees``: mean squared error of the tracked positions, normalised by their covariance; 3 if the covariance is
           right;
-        * ``switches``: number of times the track number of an obstacle changes;
+        * ``switches``: number of times that a tracked obstacle gets a new track number;
         * ``unseen``: fraction of the time in which an obstacle has no track, over all obstacles;
         * ``contacts``: list of :class:`Contact` as dictionaries.
     """

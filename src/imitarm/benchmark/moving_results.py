@@ -47,7 +47,10 @@ class MovingResults:
 
     @cached_property
     def rows(self) -> list[str]:
-        """The names of the table rows: first the methods in the order of their success, then the controls."""
+        """The names of the table rows.
+
+        The compared methods come first, in the order of their success. The methods that check the benchmark follow.
+        """
         by_row: dict[str, list[bool]] = defaultdict(list)
         for result in self.all:
             by_row[self.row_of(result)].append(result.success)
@@ -66,7 +69,7 @@ class MovingResults:
 
     @cached_property
     def by_scene(self) -> dict[Scene, dict[str, MovingResult]]:
-        """For each scene, the result of each row."""
+        """For each scene, the result of each table row (a method with its options)."""
         found: dict[Scene, dict[str, MovingResult]] = defaultdict(dict)
         for result in self.all:
             found[result.experiment.scene][self.row_of(result)] = result

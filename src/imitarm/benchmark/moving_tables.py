@@ -165,8 +165,9 @@ def quality_table(results: MovingResults) -> Table:
     note = (
         "Each row includes only the scenes in which its method succeeds. These scenes differ between methods, so "
         "compare methods in the table of paired comparisons instead. RMSE: distance from the learned motion at equal "
-        "times. Unaffected: RMSE over the samples at which the tool of the learned motion is farther than "
-        f"{100 * NEAR:.0f} cm from every obstacle. Of the path: RMSE from the nearest point of the learned path."
+        "times. RMSE, unaffected samples: RMSE over the samples at which the tool of the learned motion is farther "
+        f"than {100 * NEAR:.0f} cm from every obstacle. RMSE of the path: root mean square distance from the nearest "
+        "point of the learned path."
     )
     return Table("Quality of the successful motions", columns, tuple(rows), note)
 
@@ -354,7 +355,7 @@ def tracking_table(results: MovingResults) -> Table:
         "position error [mm]>",
         "velocity error [mm/s]>",
         "NEES (3 is right)>",
-        "changes of the track number per run>",
+        "new track numbers of tracked obstacles per run>",
         "time without a track [%]>",
     )
     note = (

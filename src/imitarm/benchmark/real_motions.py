@@ -101,9 +101,13 @@ def tables(motions: Sequence[Motion]) -> list[Table]:
     first, speed = motions[0], SPEEDS[-1]
     every = [(arm, name, *_row(starts[first.name, arm, speed], name)) for arm in _ARMS for name in RETARGETERS]
     return [
-        Table("The method modern with every motion", ("motion", "arm", "playback speed>", *_COLUMNS), tuple(modern)),
         Table(
-            f"All methods with the motion {first.name!r} at playback speed {speed:g}",
+            "Results of the method modern for every motion, arm and playback speed",
+            ("motion", "arm", "playback speed>", *_COLUMNS),
+            tuple(modern),
+        ),
+        Table(
+            f"Results of all methods for the motion {first.name!r} at playback speed {speed:g}",
             ("arm", "method", *_COLUMNS),
             tuple(every),
         ),

@@ -105,7 +105,7 @@ class Shared:
 
     @property
     def time(self) -> float:
-        """The newest simulated time [s]."""
+        """The latest time that the simulation has written [s]."""
         return float(self._values[_TIME])
 
     def publish(self, time: float, q: Array) -> None:

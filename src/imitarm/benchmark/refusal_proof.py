@@ -73,9 +73,9 @@ def explored(question: Question, *, timed: bool) -> Exploration:
 
     Args:
         question: scene and path. At least one direction of displacement must be permitted.
-        timed: whether cells are also divided in time. If False, every cell covers all times between two fixed times of
-            the path. This search is faster, and finds an answer in most scenes without moving obstacles or rotations of
-            the tool.
+        timed: whether cells are also divided in time. If False, each cell lasts from one fixed time to the next. (At a
+            fixed time, such as the start, the path must not be displaced.) The search is then faster. It finds an
+            answer in most scenes without moving obstacles or rotations of the tool.
     """
     found = Exploration(Answer.UNDECIDED)
     for frame in _frames(question, question.axes()):
@@ -352,7 +352,7 @@ def classified(leg: Leg, cells: Cells, *, timed: bool) -> tuple[Cells, Bools]:
     """Determine which cells are blocked, which cells are free, and along which axis to divide each cell.
 
     Args:
-        leg: obstacles, limits and undisplaced motion between two fixed times.
+        leg: the part of the motion between two successive fixed times, with its obstacles and limits.
         cells: new cells.
         timed: whether cells may be divided in time. If False, a limit counts only if it blocks the cell at all times.
 

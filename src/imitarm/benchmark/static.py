@@ -49,7 +49,10 @@ _REACHED = 1e-3  # [m] a posture whose tool is farther away does not reach the p
 
 
 def method_names() -> tuple[str, ...]:
-    """Return the names of all methods: controls, policies that plan a whole path, and variants of these policies."""
+    """Return the names of all methods.
+
+    These are the methods that check the benchmark, the policies that plan a whole path, and variants of these policies.
+    """
     planners = [n for n in POLICIES if n not in _WHOLE_ARM and issubclass(POLICIES[n], PathPolicy)]
     return (*CONTROLS, *planners, *VARIANTS)
 

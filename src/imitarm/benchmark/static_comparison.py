@@ -319,7 +319,7 @@ def skills_table(results: StaticResults) -> Table:
         "largest deviation [sigma]>",
     )
     note = (
-        "Scenes whose obstacles stand on the paths of skills from files. The other tables count these scenes only if "
-        "there are no other scenes."
+        "This table counts only the scenes whose obstacles stand on the path of a skill from a file (option --skill). "
+        "The other tables count these scenes only if there are no other scenes."
     )
     return Table("Skills from files", columns, tuple(rows), note)

@@ -55,8 +55,8 @@ class StaticResults:
 
     Attributes:
         all: all results.
-        rows: names of the rows; the controls come last.
-        by_scene: for each scene, the result of each row.
+        rows: names of the table rows; the methods that check the benchmark come last.
+        by_scene: for each scene, the result of each table row (a method with its options).
     """
 
     def __init__(self, results: Iterable[StaticResult]) -> None:
@@ -418,9 +418,9 @@ def time_table(results: StaticResults) -> Table:
         "peak memory, median [kB]>",
     )
     note = (
-        "Time to plan one whole path, without the construction of the policy. Computations that a process makes only "
-        "once for a skill, imports, and the training of networks and cost functions are not counted. Peak memory: "
-        "largest memory that Python allocates in a separate run."
+        "Time: the time that a method needs to plan one whole path. This time does not include the construction of the "
+        "policy, imports, the training of networks and cost functions, or computations that a process makes only once "
+        "for a skill. Peak memory: largest memory that Python allocates in a separate run."
     )
     return Table("Computing time", columns, tuple(rows), note)
 

@@ -72,7 +72,7 @@ class Draw:
     Attributes:
         method: name of the method.
         number: number of the draw. Draw 0 has the default options.
-        options: options of the draw.
+        options: the options of the method that this draw tries.
         success: rate of success in the validation scenes, from 0 to 1.
         rmse: mean RMSE of the successes [m]; nan if there is no success.
     """

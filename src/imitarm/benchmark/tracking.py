@@ -286,7 +286,7 @@ def tracking_tables(motions: Sequence[RecordedMotion], sensor: SensorModel = SEN
                 "95th percentile [mm]>",
                 "lag [ms]>",
                 "velocity, RMS [m/s]>",
-                "changes of the track number>",
+                "new track numbers of the tracked obstacle>",
             ),
             tuple(accuracy),
             said,

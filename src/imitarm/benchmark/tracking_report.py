@@ -116,7 +116,7 @@ def position_chart(log: TrackLog, name: str) -> str:
 
 
 def margin_chart(calibration: Array, test: Array) -> str:
-    """Draw the errors of the windows ``test`` over the look-ahead time, and the margin from ``calibration``."""
+    """Draw the prediction errors ``test`` over the look-ahead time, and the margin of the errors ``calibration``."""
     margin = CoverageMargin.calibrate(calibration, COVERAGE, times=TIMES)
     with canvas("margin", "Errors of predictions over the look-ahead time, and their margin", (5.5, 2.6)) as c:
         axes = c.axes(0.74, 0.78, 5.4, 2.5)

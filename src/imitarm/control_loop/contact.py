@@ -52,10 +52,10 @@ class ContactDetector:
     .. math:: r = K \Big( p - \int (\tau - \tau_f + C^T \dot q - g + r)\, dt \Big), \qquad \dot r = K (\tau_e - r) .
 
     The residual r is therefore the external torque after a low-pass filter with the time constant 1/K. The observer
-    needs no measured acceleration. For two states at :math:`t_{k-1}` and :math:`t_k`, the terms of momentum, Coriolis
-    forces and gravity are evaluated at the mean joint position. Together, these terms are the inverse dynamics for the
-    mean acceleration. The thesis mentions torque sensors that "help the robot detect collision" (3.2.3), but does not
-    describe how.
+    needs no measured acceleration. For each pair of successive states, the observer computes the inverse dynamics
+    :math:`\dot p - C^T \dot q + g` once. For this, it uses the means of the two joint positions and of the two joint
+    velocities. The acceleration is the change of the joint velocity divided by the time between the states. The thesis
+    mentions torque sensors that "help the robot detect collision" (3.2.3), but does not describe how.
 
     While a joint stands still, dry friction can balance an external torque. The residual is then uncertain by up to the
     torque of the dry friction.

@@ -195,7 +195,7 @@ def files_of(paths: Paths) -> list[str]:
     The files of a folder are sorted in natural order, ``demo_2`` before ``demo_10``. Subfolders are ignored.
 
     Raises:
-        InputError: when there are no files, or a folder holds no file with the suffix of a reader.
+        InputError: when there are no files, or no file of a folder has a suffix that belongs to a reader.
     """
     if isinstance(paths, str | os.PathLike):
         paths = [paths]

@@ -245,8 +245,8 @@ def target_lag(times: ArrayLike, tool: ArrayLike, targets: ArrayLike) -> float:
 
     Returns:
         The lag; nan when there is no target, the target does not move, or the tool does not follow the target. The tool
-        does not follow the target if its RMS error exceeds half of the target's RMS distance from the target's mean
-        position, at every lag.
+        counts as following if, at some lag, its RMS error is at most half of the target's own spread. The spread is the
+        RMS distance of the target from its mean position.
     """
     t, p, aim = (np.asarray(values, dtype=float) for values in (times, tool, targets))
     known = np.isfinite(aim).all(axis=1)

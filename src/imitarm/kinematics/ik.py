@@ -66,9 +66,9 @@ class IKSolver:
               + \sum_j \tfrac{c_j}2 \max(0, b_j - A_j v)^2 / |A_j|^2
 
     Here, each task has a Jacobian :math:`J_i` and a target :math:`t_i`, and :math:`v_p` is the joint velocity of the
-    previous step. The rows :math:`A_j v \ge b_j` have the prices (penalty weights) :math:`c_j`. Rows without a finite
-    price are hard constraints, which are kept whenever the boxes allow it. If the boxes contradict these constraints,
-    the solver first minimises the sum of the squared violations. The violation of row j is
+    previous step. The rows :math:`A_j v \ge b_j` have the prices (penalty weights) :math:`c_j`. A row with an infinite
+    price is a hard constraint. The solver keeps this constraint whenever the boxes allow it. If the boxes contradict
+    the hard constraints, the solver first minimises the sum of the squared violations. The violation of row j is
     :math:`(b_j - A_j v) / |A_j|` [rad/s]. The tasks then have second priority. The methods ``"dls"``,
     ``"dls_small_angle"`` and ``"svd"`` accept one :class:`~imitarm.kinematics.tasks.TwistTask` and optionally one
     :class:`~imitarm.kinematics.tasks.PostureTask`. These methods accept no limits except boxes:

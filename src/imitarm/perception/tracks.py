@@ -316,7 +316,7 @@ class TrackedObstacle:
         """Return the obstacle ``horizon`` seconds later, without new detections; its uncertainty grows.
 
         Args:
-            horizon: time by which the obstacle is predicted [s].
+            horizon: how far ahead the obstacle is predicted [s].
 
         Raises:
             InputError: when the horizon is not a finite number.

@@ -159,7 +159,9 @@ class Pairs(ABC):
             middles, wide = _blocks(block, reach, travel)
 
     def looked_at(self, path: ArmPath, sample: Index, pair: Index, times: Array) -> tuple[Array, Array, Array]:
-        """Return the position, the room and the gradient of chosen pairs.
+        """Return, for k given pairs, the centre of the sphere, the room, and the gradient of the room.
+
+        The room of a pair is its distance minus the required clearance and the margin.
 
         Args:
             path: postures of the arm at n samples.

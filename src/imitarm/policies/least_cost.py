@@ -129,8 +129,8 @@ class LeastCost:
     tool can reach it.
 
     The cost of an obstacle decreases gradually with the distance, so an obstacle beside the goal would keep the tool
-    away from the goal. Therefore, if the goal keeps the clearance, b is reduced by its value at the goal after the end
-    of the phase.
+    away from the goal. If a tool at the goal keeps the clearance, the policy therefore subtracts from b the value of b
+    at the goal. It does so after the end of the phase.
 
     Attributes:
         times: times of the horizon, from now, shape (H,) [s].
@@ -237,9 +237,10 @@ class LeastCost:
         return float(self._gains[-1])
 
     def smooth_costs(self, scaled: Array, sizes: Array, previous: Array, free: Array, precision: Array) -> Array:
-        """Return the costs of C candidates, except for the costs of obstacles and of the speed r, shape (C,).
+        """Return a part of the cost J of each of C candidates for u: all terms except those of b and r, shape (C,).
 
-        The task cost is a quadratic form in u, so the deviations of the candidates are not needed.
+        This part contains the task cost and the costs of the change and the size of u. The task cost is a quadratic
+        form in u, so the method does not compute the deviations e of each candidate.
 
         Args:
             scaled: u / u_max of the candidates, shape (C, 3).

@@ -167,8 +167,8 @@ class RCAMO(Policy):
     def resume(self, observation: Observation, phase: float) -> None:
         """Continue from the measured pose of the tool, at the phase ``phase`` of the motion, 0 to 1.
 
-        The motion is the one of the last :meth:`reset`. If ``reset`` was never called, the motion begins at the learned
-        start.
+        The policy continues the motion that the last call of :meth:`reset` started. Without such a call, it continues
+        the motion from the learned start.
         """
         phase = finite_number(phase, "RCAMO.resume: phase", at_least=0.0, at_most=1.0)
         instance(observation, Observation, "RCAMO.resume: observation")

@@ -8,7 +8,7 @@ motion least:
 3. narrower components, which can bend the path more sharply;
 4. the path on another side of the obstacle, or farther away from it;
 5. another posture at the start, if a collision-free motion leads to this posture first;
-6. the best failed plans again, with narrower components.
+6. the failed plans with the largest clearance, again with narrower components.
 
 If a plan takes much longer than the learned motion, the search makes a few more attempts and returns the fastest plan.
 The plan may be slow because the tool passes close to an obstacle. Then other postures would not help, and the search

@@ -128,7 +128,7 @@ class Cylinder(PosedObstacle):
 
     Attributes:
         pose: obstacle_to_base, at the middle of the cylinder's axis, with z along this axis.
-        radius: radius [m].
+        radius: radius of the cylinder [m].
         length: length from end to end [m].
     """
 

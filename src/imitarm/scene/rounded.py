@@ -72,7 +72,7 @@ class Sphere(Obstacle):
 
     Attributes:
         center: centre in the base frame, shape (3,) [m].
-        radius: radius [m].
+        radius: radius of the sphere [m].
     """
 
     kind: ClassVar[str] = "sphere"
@@ -131,7 +131,7 @@ class Capsule(Obstacle):
     Attributes:
         start: one end of the segment, in the base frame, shape (3,) [m].
         end: other end, shape (3,) [m].
-        radius: radius [m].
+        radius: radius of the capsule [m].
     """
 
     kind: ClassVar[str] = "capsule"

@@ -360,8 +360,9 @@ class SimulatedOperator:
     therefore expects the gripper at :math:`\hat p = p(t-\delta) + \rho\,(h_{end} - h(t-\delta-\lambda))`. In this
     equation, p is the observed position, :math:`\delta` is ``delay``, and :math:`h_{end}` is the hand's position after
     all sub-movements that have begun. The person expects the scale :math:`\rho` and the lag :math:`\lambda` between
-    hand and gripper. The next sub-movement of the hand is :math:`d = g\,(p_{goal}-\hat p)/\rho`. The gain g is below 1
-    over short distances and 1 over long distances.
+    hand and gripper. The next sub-movement of the hand is :math:`d = g\,(p_{goal}-\hat p)/\rho`. If the hand must move
+    farther than 3 cm and no contact is near, the gain g is 1. Otherwise, g is 0.45 to 0.7, so the hand covers only a
+    part of the distance.
 
     *Plan.* :class:`StackPlan` chooses the goals. The hand closes or opens when the error of the gripper appears to be
     within the person's tolerance. The tolerance grows with the time that the person needs for the current phase. If the

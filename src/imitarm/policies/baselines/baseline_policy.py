@@ -44,7 +44,7 @@ class ToolGaps:
             is a point.
 
     Attributes:
-        radius: radius r of the sphere [m].
+        radius: radius r of the sphere that represents the tool [m].
         n_obstacles: number of obstacles.
     """
 

@@ -77,8 +77,9 @@ class GMMDMP(CoupledMotion):
         variable_stiffness: whether K is multiplied by ``clip(mean variance / variance(t), 0.3, 3)``, so that the spring
             is stiff where the demonstrations agree. Here, ``variance(t)`` is the trace of the attractor's covariance. A
             motion without obstacles does not change.
-        n_components: number of Gaussians; None: twice the number of the skill, because an attractor has more curvature
-            than its path.
+        n_components: number of Gaussians in the mixture of the attractors. If None, this mixture has twice as many
+            Gaussians as the skill's mixture. It needs more Gaussians, because an attractor bends more sharply than the
+            path of its demonstration.
         options: arguments of :class:`~imitarm.policies.baselines.coupled_motion.CoupledMotion`.
     """
 

@@ -48,15 +48,16 @@ def learned_weights() -> dict[str, float]:
 
 
 class GmmIrl(BaselinePolicy):
-    r"""Follow the path of least cost, with a cost whose weights were learned from the paths of an expert.
+    r"""Follow the path of least cost; the weights of this cost were learned from the paths of an expert.
 
     The cost ``J = sum_k w_k phi_k`` has features ``phi_k`` with weights ``w_k``. The features measure the deviation
     from the learned path, the jerk of the deviation, and the nearness to obstacles
     (:mod:`imitarm.policies.baselines.path_cost`). The expert is an optimiser
     (:mod:`~imitarm.policies.baselines.expert`). Its paths in other scenes gave the weights, by maximum-entropy inverse
-    reinforcement learning (:mod:`imitarm.benchmark.train_irl`). The optimiser L-BFGS starts from the learned path, and
-    from paths that are displaced to each side of the obstacles. Each start leads to a local minimum; the policy follows
-    the path of the minimum with the least cost.
+    reinforcement learning (:mod:`imitarm.benchmark.train_irl`). To plan a path, the policy runs the optimiser L-BFGS
+    several times. One run starts from the learned path, and each other run starts from a path that is displaced to one
+    side of the obstacles. Each run ends at a path with a local minimum of the cost. The policy follows the path with
+    the least cost.
 
     While obstacles move, the policy minimises the cost 30 times a second over the next 20 points
     (:class:`HorizonReaction`). The distance to obstacles is a part of the cost and not a constraint. The path may

@@ -280,8 +280,9 @@ class RRTConnect(PathPolicy):
 class TiltLimitedRRTConnect(RRTConnect):
     """:class:`RRTConnect` with ACFRA's default of ``max_tilt``: two standard deviations of the demonstrations.
 
-    The standard deviation is the one at the nearest point of the learned path. If the skill has no learned orientation,
-    pass ``max_tilt``: the default is then 0, which a random search can't keep, and planning raises an error.
+    Each pose of the tool has its own limit. The planner computes this limit from the standard deviation at the point of
+    the learned path that is nearest to the tool. If the skill has no learned orientation, pass ``max_tilt``: the
+    default is then 0, which a random search can't keep, and planning raises an error.
     """
 
     def _limits(self, components: ComponentPath) -> Array | None:

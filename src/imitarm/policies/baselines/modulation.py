@@ -23,9 +23,9 @@ def modulated(desired: Array, around: NearObstacles, *, reactivity: float = 1.0,
     r"""Return the modulated velocity.
 
     Let ``v_o`` be the velocity of an obstacle, ``n`` its outward normal, and ``r`` the direction from its centre to the
-    tool. Let ``gap`` be the distance to the tool minus the required clearance, and ``size`` the sum of the obstacle's
-    radius, the tool's radius and the required clearance. The modulation multiplies the velocity relative to the
-    obstacle by a matrix M::
+    tool. Let ``gap`` be the distance between obstacle and tool, minus the required clearance. Let ``size`` be the sum
+    of the obstacle's radius, the tool's radius and the required clearance. The modulation multiplies the velocity
+    relative to the obstacle by a matrix M::
 
         v = M (u - v_o) + v_o,   M = E diag(1 - q, 1 + q, 1 + q) E^-1,   E = [r, e_1, e_2],   e_i . n = 0
         q = Gamma^(-1 / reactivity),   Gamma = (1 + gap / (reach size))^2

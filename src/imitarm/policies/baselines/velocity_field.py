@@ -84,7 +84,7 @@ class VelocityField(BaselinePolicy):
 
     Args:
         skill: skill to reproduce.
-        pull: k, gain with which the tool is pulled to the point [1/s].
+        pull: k, the additional speed of the tool towards the point, divided by its distance from the point [1/s].
         slack: e_0, distance between tool and point at which the rate is one half [m].
         options: arguments of :class:`~imitarm.policies.baselines.baseline_policy.BaselinePolicy`.
     """
