@@ -239,7 +239,7 @@ def test_errors_of_tracks_and_changes_of_their_numbers_are_counted():
     assert found["unseen"] == pytest.approx(1.0 / 11.0)
 
 
-# --- methods that check the benchmark
+# --- methods that check the benchmark ---------------------------------------------------------------------------------
 
 
 def test_the_search_goes_around_a_wall_and_waits_for_a_gate():

@@ -204,7 +204,7 @@ def test_torques_hold_at_least_the_weight_of_the_arm(case):
     assert math.isnan(torques_on_sawyer(far)["torque_rms"])
 
 
-# --- methods that check the benchmark: a benchmark that a toy can win is void ------------------------------------------------------------
+# --- methods that check the benchmark: a benchmark that a toy can win is void -----------------------------------------
 
 
 def test_a_method_that_aims_at_the_obstacle_never_succeeds_and_no_avoidance_hardly_ever():

@@ -381,7 +381,10 @@ def fit_weights(
 
 
 def progress_at(fraction: Array, progress_weights: Array, gains: Gains) -> Array:
-    """Return the travelled fraction of the path, 0 to 1, at n times; ``fraction`` (n,) is each time divided by the duration."""
+    """Return the travelled fraction of the path, 0 to 1, at n times.
+
+    The argument ``fraction``, shape (n,), contains each time divided by the duration.
+    """
     R = _responses(gains, len(progress_weights)).spline(np.clip(fraction, 0.0, 1.0))
     return np.asarray(R[:, 2] + R[:, 3:] @ (progress_weights - 1.0))
 
