@@ -1,4 +1,4 @@
-"""The question whether a path exists in a scene, as the oracle of refusals needs it."""
+"""The input of the oracle of refusals: a scene and a path, for which the oracle decides whether a detour exists."""
 
 from __future__ import annotations
 

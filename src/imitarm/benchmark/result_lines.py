@@ -137,7 +137,8 @@ class LineStore(Store[Work, Outcome]):
     def known(self, experiments: Sequence[Work]) -> dict[Work, Outcome]:
         """Return the saved results that can be used.
 
-        Unreadable lines and, without ``reuse``, results of other code are left out.
+        The method leaves out unreadable lines. Without ``reuse``, it also leaves out the results that
+        another version of the code computed.
         """
         wanted = set(experiments)
         found: dict[Work, Outcome] = {}

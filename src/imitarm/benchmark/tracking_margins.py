@@ -120,7 +120,7 @@ def recorded_windows(motion: RecordedMotion, part: tuple[float, float], sensor: 
 
     Args:
         motion: the motion.
-        part: start and end of the part of the recording that is used, as fractions of its duration.
+        part: the used part of the recording: its start and its end, as fractions of the duration of the recording.
         sensor: the sensor.
     """
     begin, end = (fraction * motion.duration for fraction in part)

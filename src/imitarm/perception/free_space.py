@@ -47,8 +47,8 @@ class FreeSpace:
 
         Args:
             points: points in the base frame [m].
-            margin: smallest distance by which the ray must end behind the point [m]; three standard deviations are
-                added.
+            margin: a point counts as empty only if the camera's ray through it ends behind it, by more than this
+                distance plus three standard deviations of the depth [m].
         """
         empty = np.zeros(points.shape[:-1], dtype=bool)
         for surface in self._surfaces:
@@ -64,8 +64,8 @@ class FreeSpace:
 
         Args:
             points: points in the base frame [m].
-            margin: smallest distance by which the ray must end in front of the point [m]; three standard deviations are
-                added.
+            margin: a point counts as hidden only if the camera's ray through it ends in front of it, by more than this
+                distance plus three standard deviations of the depth [m].
         """
         if self._frame is None:
             return np.zeros(points.shape[:-1], dtype=bool)

@@ -216,8 +216,8 @@ class LeastDetour:
     """Finds the least detours of one path among one set of obstacles, for all spheres of the tool.
 
     Attributes:
-        target: distance from obstacles that is planned at the samples [m]: the clearance, plus a small addition for the
-            segments between the samples.
+        target: distance from obstacles that the planner requires at the samples [m]. It is slightly larger than the
+            clearance, so that the segments between the samples also keep the clearance.
         movable: whether a displacement of components can move each sample, shape (n,).
     """
 

@@ -52,8 +52,9 @@ class ModernRetargeter(Retargeter):
     1. Extrapolate the arm estimate (:class:`~imitarm.retarget.arm_estimator.ArmEstimator`) from the last camera frame
        with a decaying velocity. Let W be the wrist's position and v its velocity at the last frame. After s seconds,
        the wrist is at :math:`W + v\,\tau(1 - e^{-s/\tau})`, with :math:`\tau` = 50 ms.
-    2. Compute the tool's target pose :math:`T_d` and the twist from the tool's pose T towards the target: :math:`K
-       \log(T_d T^{-1})` plus a fraction of the hand's velocity (feed-forward).
+    2. Compute the target pose :math:`T_d` of the tool, and the desired twist of the tool. This twist is
+       :math:`K \log(T_d T^{-1})` plus a fraction of the hand's velocity (feed-forward). Here, T is the tool's current
+       pose.
     3. Solve a quadratic programme for the joint velocities. Its two tasks are the twist of the tool and the elbow angle
        (the SEW angle: the angle of the plane through shoulder, elbow and wrist). Its constraints are the joint limits
        of position, velocity and acceleration, and minimum distances between the links and from the links to obstacles.

@@ -113,8 +113,8 @@ class DMPANN(CoupledMotion):
 
     **Known failure.** The expert passes an obstacle on one of two sides. If the tool moves straight at the obstacle,
     the features do not show which side the expert chooses. The network then returns a mean of the terms for both sides,
-    which does not avoid the obstacle. The training scenes have only one obstacle. For several obstacles, the terms are
-    added, which the training does not cover.
+    which does not avoid the obstacle. The training scenes have only one obstacle. If several obstacles are near, the
+    policy adds their coupling terms. The network has not been trained for this case.
 
     Args:
         skill: skill to reproduce.
