@@ -1,6 +1,6 @@
 """Motions of obstacles in the moving benchmark.
 
-At a given time, each obstacle is at a point where it meets the tool.
+Each motion passes through a given point at a given time. There, the obstacle meets a tool on the learned motion.
 """
 
 from __future__ import annotations

@@ -164,10 +164,10 @@ def quality_table(results: MovingResults) -> Table:
     )
     note = (
         "Each row includes only the scenes in which its method succeeds. These scenes differ between methods, so "
-        "compare methods in the table of paired comparisons instead. RMSE: distance from the learned motion at equal "
-        "times. RMSE, unaffected samples: RMSE over the samples at which the tool of the learned motion is farther "
-        f"than {100 * NEAR:.0f} cm from every obstacle. RMSE of the path: root mean square distance from the nearest "
-        "point of the learned path."
+        "compare methods in the table of paired comparisons instead. RMSE: root mean square distance from the learned "
+        "motion at equal times. RMSE, unaffected samples: RMSE over the samples at which the tool of the learned "
+        f"motion is farther than {100 * NEAR:.0f} cm from every obstacle. RMSE of the path: root mean square distance "
+        "from the nearest point of the learned path."
     )
     return Table("Quality of the successful motions", columns, tuple(rows), note)
 

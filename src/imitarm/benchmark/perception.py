@@ -44,7 +44,8 @@ class Seen:
             in the same cases as ``excess``.
         normalised: squared Mahalanobis distance of the position error, by the covariance of the detection; nan in the
             same cases as ``excess``.
-        right_shape: whether the detection has the true kind of shape, for example a sphere; False in the same cases.
+        right_shape: whether the detection has the true kind of shape, for example a sphere; False if the
+            obstacle was missed or merged.
     """
 
     family: str

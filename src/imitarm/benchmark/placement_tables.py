@@ -102,10 +102,10 @@ def _beside_the_tool(results: Sequence[PlacementResult]) -> Table:
             f"ratio of the medians (target: at most {_RATIO_TARGET:g})",
         ),
         tuple(rows),
-        "Whole arm: the path that the simulated arm executed. Tool alone: the path that ACFRA plans in the same "
-        "scene between the same ends, if only the tool must keep the clearance. RMSE: distance between the path and "
-        "the mean of the demonstrations, at 200 points that are evenly spaced along each path and matched by dynamic "
-        "time warping. Intervals: paired bootstrap over placements, 95 %.",
+        "Whole arm: the path that the simulated arm executed. Tool alone: the path that ACFRA plans in the same scene "
+        "between the same ends, if only the tool must keep the clearance. RMSE: root mean square distance between the "
+        "path and the mean of the demonstrations, at 200 points that are evenly spaced along each path and matched by "
+        "dynamic time warping. Intervals: paired bootstrap over placements, 95 %.",
     )
 
 

@@ -377,10 +377,11 @@ def quality_table(results: StaticResults) -> Table:
     )
     note = (
         "Means over the successes of each method. The methods succeed in different scenes; the paired comparison uses "
-        "common scenes. RMSE: distance between planned and learned path at equal fractions of their durations (thesis "
-        "Eq 4.9, with the square root). Unaffected samples: samples of the learned path at which the tool is farther "
-        f"than {1e2 * NEAR:.0f} cm from every obstacle. RMSE of the path: distance from each sample of the learned "
-        "path to the nearest point of the planned path. Length and duration are divided by those of the learned path."
+        "common scenes. RMSE: root mean square distance between planned and learned path at equal fractions of their "
+        "durations (thesis Eq 4.9, with the square root). Unaffected samples: samples of the learned path at which "
+        f"the tool is farther than {1e2 * NEAR:.0f} cm from every obstacle. RMSE of the path: distance from each "
+        "sample of the learned path to the nearest point of the planned path. Length and duration are divided by "
+        "those of the learned path."
     )
     return Table("Quality of the successful paths", columns, tuple(rows), note)
 

@@ -157,8 +157,8 @@ def joint_steps(times: Array, positions: Array) -> tuple[Array, Array]:
 def hand_speed(times: Array, positions: Array, spikes: Mask) -> float:
     """Return the speed of the faster hand [m/s].
 
-    The speed of a hand is the 90th percentile of its mean speeds over three frames. Mean speeds that begin or end in a
-    spike are left out.
+    The speed of a hand is the 90th percentile of its mean speeds over three frames. A mean speed does not count if its
+    first or its last frame is in a spike.
 
     Args:
         times: time stamps, shape (n,) [s], increasing.
