@@ -140,7 +140,7 @@ def test_an_empty_image_has_no_obstacles():
     ("changes", "message"),
     [
         ({"arm": "sawyer"}, "arm must be a ArmModel"),
-        ({"surfaces": [1]}, "fixtures"),
+        ({"surfaces": [1]}, "surfaces"),
         ({"workspace": ((1, 1, 1), (0, 0, 0))}, "lowest and the highest corner"),
         ({"depth_range": (5.0, 0.5)}, "depth_range must be two increasing"),
         ({"noise": 0.01}, "noise"),

@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 
 _FLOAT64 = np.dtype(np.float64)
+_LATEST = 1e12  # [s] largest time stamp; a stamp of the year 2020 in nanoseconds is 1.6e18
 _LONGEST_SHOWN = 60  # characters of a refused value that a message repeats
 
 
@@ -127,6 +128,18 @@ def finite_number(
         bounds = _bounds(above, at_least, at_most)
         raise InputError(f"{what} must be a finite number{bounds}{_bracketed(unit)}, got {number}")
     return number
+
+
+def time_stamp(value: Any, what: str) -> float:
+    """Return ``value`` as a time stamp in seconds, at most 1e12 s from 0.
+
+    Raises:
+        InputError: when the value is not one finite number, or is larger. A stamp in nanoseconds is larger.
+    """
+    seconds = finite_number(value, what, "s")
+    if not -_LATEST <= seconds <= _LATEST:
+        raise InputError(f"{what} must be within {_LATEST:g} s of 0, got {seconds:g}; give it in seconds")
+    return seconds
 
 
 def whole_number(value: Any, what: str, *, at_least: int | None = None, at_most: int | None = None) -> int:

@@ -10,16 +10,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from imitarm.control_loop.observer import Tracker
+from imitarm.control_loop.observer import Tracker, checked_tracker
 from imitarm.errors import InputError, TaskFailedError
 from imitarm.kinematics.pose import Pose
 from imitarm.perception import DepthFrame, ObstacleDetector, PointCloud
 from imitarm.scene import Obstacle, Scene
-from imitarm.validation import finite_number, function, instance
+from imitarm.validation import finite_number, function, instance, sequence
 
 Frame = DepthFrame | PointCloud
 
 _ROUNDING = 1e-9  # [s]
+_OTHER_CLOCK = 10.0  # [s] age at which the first image of a camera must come from another clock
 
 
 class _Waiting(NamedTuple):
@@ -42,7 +43,12 @@ class CameraObserver:
     **A frozen camera.** Only an image with a later time stamp than the previous image is used. If the newest image is
     older than ``max_age``, the obstacles are no longer predicted, and the scene keeps the stamp of the newest image.
     From this stamp, a watchdog can compute the age of the scene. Before the first image arrives, the scene is empty,
-    and its stamp is the time of the first call.
+    and its stamp is the time of the first call. To keep the arm at rest until images arrive, use
+    ``Watchdog(from_start=True)``.
+
+    **Wrong clocks.** An image from the future would hide that a camera is frozen. Therefore, ``observe(t)`` raises
+    InputError if the stamp of an image is later than the call by more than ``max_age``. It also does so if the first
+    image of a camera is more than 10 s old.
 
     **A camera that was moved.** Once per second, the surfaces in an image are compared with the known places of these
     surfaces (:meth:`~imitarm.perception.ObstacleDetector.camera_error`). If they are not at their known places in two
@@ -96,12 +102,13 @@ class CameraObserver:
         if joints is None and detector.arm is not None:
             raise InputError(f"{name}: joints is required, because the detector removes the arm from the images")
         self._joints = None if joints is None else function(joints, f"{name}: joints")
-        self.tracker = tracker
+        self.tracker = checked_tracker(tracker, f"{name}: tracker")
         self.rate = finite_number(rate, f"{name}: rate", "Hz", above=0.0)
         self.latency = finite_number(latency, f"{name}: latency", "s", at_least=0.0)
         self.max_age = finite_number(max_age, f"{name}: max_age", "s", above=self.latency)
         self.clock = finite_number(clock, f"{name}: clock", "s")
-        self._goal, self._fixtures = goal, tuple(fixtures)
+        known = Scene(goal, (), 0.0, sequence(fixtures, Obstacle, f"{name}: fixtures"))  # type: ignore[type-abstract]
+        self._goal, self._fixtures = known.goal, known.fixtures
         self.reset()
 
     def reset(self) -> None:
@@ -116,6 +123,7 @@ class CameraObserver:
         self._doubted = [False] * len(self._cameras)
         self._next, self._now = -math.inf, -math.inf
         self._stamp: float | None = None
+        self._first: float | None = None  # time of the first call [s]
 
     @property
     def stamp(self) -> float | None:
@@ -127,6 +135,7 @@ class CameraObserver:
 
         Raises:
             InputError: when ``time`` is not a finite number, or is earlier than in the last call.
+                Also when a camera returns something else than an image, or an image has the stamp of another clock.
             TaskFailedError: when a camera was moved.
         """
         time = finite_number(time, "CameraObserver: time", "s")
@@ -136,15 +145,17 @@ class CameraObserver:
                 "not decrease. Call reset() before a new run"
             )
         self._now = time
+        if self._first is None:
+            self._first = time
         if self._joints is not None:
             self.detector.record(time + self.clock, self._joints())
         if time >= self._next - _ROUNDING:
             self._take(time)
         while self._waiting and self._waiting[0].arrival <= time + _ROUNDING:
             self._use(self._waiting.popleft())
-        fresh = self._stamp is None or time - self._stamp <= self.max_age
-        at = time if fresh or self._stamp is None else self._stamp
-        return self.tracker.scene(at, goal=self._goal, fixtures=self._fixtures)
+        newest = self._first if self._stamp is None else self._stamp
+        fresh = self._stamp is not None and time - self._stamp <= self.max_age
+        return self.tracker.scene(time if fresh else newest, goal=self._goal, fixtures=self._fixtures)
 
     def _take(self, time: float) -> None:
         """Let every camera take an image, and plan the next."""
@@ -153,9 +164,27 @@ class CameraObserver:
         self._next = start + float(periods) / self.rate
         for i, camera in enumerate(self._cameras):
             frame = camera()
-            if frame is not None and frame.stamp > self._taken[i]:
+            if frame is None:
+                continue
+            if not isinstance(frame, DepthFrame | PointCloud):
+                raise InputError(
+                    f"CameraObserver: camera {i + 1} must return a DepthFrame, a PointCloud or None, got {frame!r}"
+                )
+            if frame.stamp > self._taken[i]:
+                self._check_clock(time, frame, i)
                 self._taken[i] = frame.stamp
                 self._waiting.append(_Waiting(time + self.latency, frame, i))
+
+    def _check_clock(self, time: float, frame: Frame, camera: int) -> None:
+        """Reject an image from the future, and a first image that is too old: their clock differs from the calls'."""
+        age = time + self.clock - frame.stamp
+        first = math.isinf(self._taken[camera])
+        if age < -self.max_age or (first and age > _OTHER_CLOCK):
+            raise InputError(
+                f"CameraObserver: an image of camera {camera + 1} has the stamp {frame.stamp:.3f} s, {abs(age):.3g} s "
+                f"{'after' if age < 0.0 else 'before'} the time of the call; set clock to the difference between the "
+                "clocks of images and of calls, or correct the camera's clock"
+            )
 
     def _use(self, waiting: _Waiting) -> None:
         """Find the obstacles in an image that has arrived, and give them to the tracker."""

@@ -7,8 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from imitarm.errors import InputError
 from imitarm.kinematics.arm import ArmModel, ArmState
-from imitarm.validation import finite_number, finite_vector, instance
+from imitarm.validation import finite_number, finite_numbers, finite_vector, instance
 
 Array = NDArray[np.float64]
 
@@ -88,8 +89,11 @@ class ContactDetector:
             self.threshold = _SHARE * np.where(np.isfinite(arm.max_torque), arm.max_torque, _UNRATED / _SHARE)
             self.threshold += self._dry
         else:
-            given = np.broadcast_to(np.asarray(threshold, dtype=float), (arm.n_joints,))
+            given = finite_numbers(threshold, "ContactDetector: threshold", "N m")
+            given = np.repeat(given, arm.n_joints) if len(given) == 1 else given
             self.threshold = finite_vector(given, arm.n_joints, "ContactDetector: threshold", "N m").copy()
+            if self.threshold.min() <= 0.0:
+                raise InputError(f"ContactDetector: threshold must be above 0 [N m], got {self.threshold.min():g}")
         self.reset()
 
     def reset(self) -> None:
@@ -106,7 +110,12 @@ class ContactDetector:
 
         Returns:
             The contact; None when no external torque exceeds its threshold.
+
+        Raises:
+            InputError: when ``state`` is not an ArmState, or has another number of joints than the arm.
         """
+        instance(state, ArmState, "ContactDetector.update: state")
+        finite_vector(state.q, self.arm.n_joints, "ContactDetector.update: q of the state", "rad")
         last, self._last = self._last, state
         dt = 0.0 if last is None else state.time - last.time
         if last is None or not 0.0 < dt <= _GAP or not state.torque.any():

@@ -20,12 +20,13 @@ from imitarm.errors import InputError
 from imitarm.kinematics.pose import Pose
 from imitarm.perception import Detection
 from imitarm.scene import MovingScene, Obstacle, Scene
-from imitarm.validation import finite_number, instance, whole_number
+from imitarm.validation import finite_number, instance, sequence, whole_number
 
 Array = NDArray[np.float64]
 
 HIDDEN = 0.5
 """Duration of one occlusion [s]."""
+_FASTEST = 1e4  # [Hz] rate of a sensor; more frames would take too long to simulate
 _RAREST = 0.01  # [1/s] occlusions
 _LEAST_SIGMA = 1e-3  # [m] a covariance of 0 would make a tracker follow every rounding error
 _FRAME, _HIDING = 0, 1  # streams of random numbers
@@ -65,7 +66,7 @@ class SensorModel:
 
     Attributes:
         noise: sigma, the standard deviation of the measured position along each axis [m].
-        rate: frames per second [Hz].
+        rate: frames per second, at most 10 000 [Hz].
         latency: delay of each frame [s].
         dropout: probability from 0 to below 1 that an obstacle is missed in a frame.
         occlusions: occlusions of each obstacle per second, from 0.01 to 1 [1/s]; 0: none.
@@ -87,7 +88,7 @@ class SensorModel:
     def __post_init__(self) -> None:
         name = type(self).__name__
         finite_number(self.noise, f"{name}: noise", "m", at_least=0.0)
-        finite_number(self.rate, f"{name}: rate", "Hz", above=0.0)
+        finite_number(self.rate, f"{name}: rate", "Hz", above=0.0, at_most=_FASTEST)
         finite_number(self.latency, f"{name}: latency", "s", at_least=0.0)
         if not 0.0 <= finite_number(self.dropout, f"{name}: dropout") < 1.0:
             raise InputError(f"{name}: dropout must be a probability from 0 to below 1, got {self.dropout!r}")
@@ -103,7 +104,13 @@ class SensorModel:
         Args:
             truth: the true obstacles over time.
             k: number of the frame.
+
+        Raises:
+            InputError: when ``truth`` is not a scene, or ``k`` is not a whole number.
         """
+        k = whole_number(k, "SensorModel.frame: k")
+        if not isinstance(truth, Scene | MovingScene):
+            raise InputError(f"SensorModel.frame: truth must be a Scene or a MovingScene, got {truth!r}")
         stamp = k / self.rate
         shapes = truth.obstacles if isinstance(truth, Scene) else truth.scene.obstacles
         rng = np.random.default_rng([self.seed, _FRAME, int(k < 0), abs(k)])
@@ -157,6 +164,17 @@ class Tracker(Protocol):
         """Delete all tracks."""
 
 
+def checked_tracker(tracker: Tracker, what: str) -> Tracker:
+    """Return ``tracker`` unchanged if it has the methods of :class:`Tracker`.
+
+    Raises:
+        InputError: when a method is missing.
+    """
+    if not all(callable(getattr(tracker, name, None)) for name in ("update", "scene", "reset")):
+        raise InputError(f"{what} must be an ObstacleTracker, or have its methods update, scene and reset: {tracker!r}")
+    return tracker
+
+
 class TrackedScene:
     """Tracks a scene from the frames that have arrived; call it as ``observe(t)``.
 
@@ -188,8 +206,10 @@ class TrackedScene:
     ) -> None:
         if not isinstance(truth, Scene | MovingScene):
             raise InputError(f"TrackedScene: truth must be a Scene or a MovingScene, got {truth!r}")
-        self.truth, self.sensor, self.tracker = truth, instance(sensor, SensorModel, "TrackedScene: sensor"), tracker
-        self._goal, self._fixtures = goal, tuple(fixtures)
+        self.truth, self.sensor = truth, instance(sensor, SensorModel, "TrackedScene: sensor")
+        self.tracker = checked_tracker(tracker, "TrackedScene: tracker")
+        known = Scene(goal, (), 0.0, sequence(fixtures, Obstacle, "TrackedScene: fixtures"))  # type: ignore[type-abstract]
+        self._goal, self._fixtures = known.goal, known.fixtures
         self._lead = finite_number(lead, "TrackedScene: lead", "s", at_least=0.0)
         self._until = 0.0
         self._restart()

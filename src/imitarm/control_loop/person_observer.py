@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 from imitarm.capture.skeleton import Skeleton
-from imitarm.control_loop.observer import Tracker
+from imitarm.control_loop.observer import Tracker, checked_tracker
 from imitarm.errors import InputError
 from imitarm.perception import ObstacleTracker, PersonCapsules
 from imitarm.scene import Scene
@@ -57,7 +58,8 @@ class PersonObserver:
     ) -> None:
         name = type(self).__name__
         self.capsules = instance(capsules, PersonCapsules, f"{name}: capsules")
-        self.tracker = ObstacleTracker(process_noise=PERSON_NOISE) if tracker is None else tracker
+        given = ObstacleTracker(process_noise=PERSON_NOISE) if tracker is None else tracker
+        self.tracker = checked_tracker(given, f"{name}: tracker")
         self.latency = finite_number(latency, f"{name}: latency", "s", at_least=0.0)
         self.max_age = finite_number(max_age, f"{name}: max_age", "s", above=self.latency)
         try:
@@ -68,16 +70,28 @@ class PersonObserver:
         self._shift: float | None = 0.0 if start is None else None
         self._waiting: Skeleton | None = None
         self._stamp: float | None = None
+        self._now = -math.inf
         self.n_skeletons = 0
         self.tracker.reset()
 
     def __call__(self, time: float) -> Scene:
-        """Return the scene at ``time`` [s], from the skeletons that have arrived until then."""
+        """Return the scene at ``time`` [s], from the skeletons that have arrived until then.
+
+        Raises:
+            InputError: when ``time`` is not a finite number, or is earlier than in the last call. Also when an item of
+                ``skeletons`` is not a Skeleton.
+        """
         time = finite_number(time, "PersonObserver: time", "s")
+        if time < self._now:
+            raise InputError(
+                f"PersonObserver: time {time:g} s is earlier than in the last call ({self._now:g} s), but times must "
+                "not decrease. Make a new PersonObserver for a new run"
+            )
+        self._now = time
         while (stamp := self._next_stamp()) is not None and stamp + self.latency <= time + _ROUNDING:
             assert self._waiting is not None
             self.tracker.update(stamp, self.capsules.detections(self._waiting))
-            self._waiting, self._stamp = None, stamp
+            self._waiting, self._stamp = None, stamp if self._stamp is None else max(stamp, self._stamp)
             self.n_skeletons += 1
         fresh = self._stamp is None or time - self._stamp <= self.max_age
         return self.tracker.scene(time if fresh or self._stamp is None else self._stamp)
@@ -88,6 +102,7 @@ class PersonObserver:
             self._waiting = next(self._skeletons, None)
             if self._waiting is None:
                 return None
+            instance(self._waiting, Skeleton, "PersonObserver: an item of skeletons")
         if self._shift is None:
             self._shift = (self._start or 0.0) - self._waiting.time
         return self._waiting.time + self._shift
@@ -113,8 +128,15 @@ class CombinedObserver:
         self._observers = tuple(function(observer, "CombinedObserver: observer") for observer in observers)
 
     def __call__(self, time: float) -> Scene:
-        """Return the obstacles of all observers at ``time`` [s]."""
-        scenes: list[Scene] = [observe(time) for observe in self._observers]
+        """Return the obstacles of all observers at ``time`` [s].
+
+        Raises:
+            InputError: when ``time`` is not a finite number, or an observer does not return a Scene.
+        """
+        time = finite_number(time, "CombinedObserver: time", "s")
+        scenes = [
+            instance(observe(time), Scene, "CombinedObserver: an observer's scene") for observe in self._observers
+        ]
         stamp = min(scene.stamp for scene in scenes)
         n, obstacles = len(scenes), []
         for i, scene in enumerate(scenes):

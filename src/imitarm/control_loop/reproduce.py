@@ -15,14 +15,14 @@ from imitarm.control_loop.contact import Contact, ContactDetector
 from imitarm.control_loop.interventions import InterventionLog
 from imitarm.control_loop.watchdog import Watchdog
 from imitarm.errors import InfeasibleError, InputError
-from imitarm.kinematics.arm import ArmState
+from imitarm.kinematics.arm import ArmModel, ArmState
 from imitarm.kinematics.pose import Pose
 from imitarm.policies.policy import Observation, Policy
 from imitarm.robots.robot import Robot
 from imitarm.safety import SafetyFilter, SafetyStep
 from imitarm.scene import Scene
 from imitarm.trajectory import Rollout, Trajectory
-from imitarm.validation import finite_number, flag, instance
+from imitarm.validation import finite_number, flag, function, instance
 
 Array = NDArray[np.float64]
 
@@ -100,18 +100,25 @@ def reproduce(
         safety filter.
 
     Raises:
-        InputError: when ``dt`` or ``timeout`` is not positive, or the policy does not return a Command.
+        InputError: when ``dt`` or ``timeout`` is not positive, an argument has the wrong type, or ``safety`` or
+            ``contact`` was made for another arm. Also when the policy does not return a Command.
         InfeasibleError: when the arm starts in contact with an obstacle, or the policy refuses to start; in both cases,
             the robot has not moved.
     """
     dt, timeout = finite_number(dt, "reproduce: dt", "s"), finite_number(timeout, "reproduce: timeout", "s")
     if not 0.0 < dt <= timeout:
         raise InputError(f"reproduce: needs 0 < dt <= timeout [s], got dt {dt!r} and timeout {timeout!r}")
-    keeper = SafetyFilter(robot.arm, dt=dt) if safety is None else safety
+    instance(policy, Policy, "reproduce: policy")  # type: ignore[type-abstract]
+    instance(robot, Robot, "reproduce: robot")  # type: ignore[type-abstract]
+    function(observe, "reproduce: observe")
+    if on_step is not None:
+        function(on_step, "reproduce: on_step")
+    keeper = SafetyFilter(robot.arm, dt=dt) if safety is None else instance(safety, SafetyFilter, "reproduce: safety")
     if keeper.dt != dt:
         raise InputError(
             f"reproduce: the safety filter was made for dt {keeper.dt:g} s, not {dt:g} s; use the same dt for both"
         )
+    _check_arm(keeper.arm, robot, "safety filter")
     watch = Watchdog() if watchdog is None else instance(watchdog, Watchdog, "reproduce: watchdog")
     watch.reset()
     detector, touch = _detector(robot, contact), None
@@ -153,11 +160,21 @@ def reproduce(
 def _detector(robot: Robot, contact: ContactDetector | bool) -> ContactDetector | None:
     """Return the detector of contacts for one motion; None if there is none."""
     if isinstance(contact, ContactDetector):
+        _check_arm(contact.arm, robot, "detector of contacts")
         contact.reset()
         return contact
     if flag(contact, "reproduce: contact") and robot.arm.has_dynamics:
         return ContactDetector(robot.arm)
     return None
+
+
+def _check_arm(arm: ArmModel, robot: Robot, what: str) -> None:
+    """Reject a filter or a detector that was made for an arm with other joints."""
+    if arm.joint_names != robot.arm.joint_names:
+        raise InputError(
+            f"reproduce: the {what} was made for the arm {arm.name}, not for the robot's arm {robot.arm.name}; make it "
+            "with robot.arm"
+        )
 
 
 def _unfinished(timeout: float, last: Command, robot: Robot) -> str:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from imitarm.command import Command, Status
 from imitarm.errors import InputError
-from imitarm.validation import finite_number, flag
+from imitarm.validation import finite_number, flag, instance
 
 
 class Watchdog:
@@ -42,7 +42,7 @@ class Watchdog:
 
     def reset(self) -> None:
         """Forget all scenes."""
-        self._newest, self._since = -math.inf, 0.0
+        self._newest, self._since, self._time = -math.inf, 0.0, -math.inf
         self._alive = self.from_start
 
     def guard(self, command: Command, stamp: float, time: float) -> Command:
@@ -51,8 +51,20 @@ class Watchdog:
         Args:
             command: command of the policy.
             stamp: stamp of the latest scene [s].
-            time: current time [s].
+            time: current time [s]; it must not decrease from one call to the next.
+
+        Raises:
+            InputError: when ``command`` is not a Command, or a time is not a finite number or decreases.
         """
+        instance(command, Command, "Watchdog.guard: command")
+        stamp = finite_number(stamp, "Watchdog.guard: stamp", "s")
+        time = finite_number(time, "Watchdog.guard: time", "s")
+        if time < self._time:
+            raise InputError(
+                f"Watchdog.guard: time {time:g} s is earlier than in the last call ({self._time:g} s); call reset() "
+                "before a new run"
+            )
+        self._time = time
         if stamp > self._newest:
             self._alive |= self._newest > -math.inf
             self._newest, self._since = stamp, time

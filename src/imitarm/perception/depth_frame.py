@@ -10,9 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from imitarm.errors import InputError
 from imitarm.html_table import html_table
 from imitarm.kinematics.pose import Pose
-from imitarm.validation import finite_array, finite_number, instance, real_array, whole_number
+from imitarm.validation import finite_array, finite_number, instance, real_array, time_stamp, whole_number
 
 Array = NDArray[np.float64]
+
+_FARTHEST = 100.0  # [m] if most depths are larger, they are in millimetres
 
 
 @dataclass(frozen=True)
@@ -92,10 +94,12 @@ class DepthFrame:
             by nan.
         intrinsics: intrinsic parameters of the camera.
         camera_to_base: pose of the camera when the image was taken.
-        color: red, green and blue of each pixel, 0 to 1, shape (height, width, 3); None for a camera without colours.
+        color: red, green and blue of each pixel, 0 to 1, shape (height, width, 3); nan where a colour is unknown. None
+            for a camera without colours.
 
     Raises:
-        InputError: when the shape does not match the camera, a depth is negative, or a number is not finite.
+        InputError: when the shape does not match the camera, a depth is negative, or the stamp is not finite. Also when
+            most depths are beyond 100 m, as in an image in millimetres, or a colour is not from 0 to 1.
     """
 
     stamp: float
@@ -107,7 +111,7 @@ class DepthFrame:
     def __post_init__(self) -> None:
         camera = instance(self.intrinsics, Intrinsics, "DepthFrame: intrinsics")
         instance(self.camera_to_base, Pose, "DepthFrame: camera_to_base")
-        object.__setattr__(self, "stamp", finite_number(self.stamp, "DepthFrame: stamp", "s"))
+        object.__setattr__(self, "stamp", time_stamp(self.stamp, "DepthFrame: stamp"))
         depth = np.array(real_array(self.depth, (camera.height, camera.width), "DepthFrame: depth", "m"))
         if np.any(depth < 0.0):
             row, column = np.argwhere(depth < 0.0)[0].tolist()
@@ -115,10 +119,12 @@ class DepthFrame:
                 f"DepthFrame: depth must not be negative [m], but depth[{row}, {column}] is {depth[row, column]}"
             )
         depth[(depth == 0.0) | np.isinf(depth)] = np.nan
+        check_lengths(depth, "DepthFrame: depth")
         depth.setflags(write=False)
         object.__setattr__(self, "depth", depth)
         if self.color is not None:
             color = np.array(real_array(self.color, (camera.height, camera.width, 3), "DepthFrame: color"))
+            check_colors(color, "DepthFrame: color")
             color.setflags(write=False)
             object.__setattr__(self, "color", color)
 
@@ -152,3 +158,33 @@ class DepthFrame:
             return "nothing measured"
         share = 100.0 * len(measured) / self.depth.size
         return f"{share:.0f} % measured, from {measured.min():.2f} to {measured.max():.2f} m"
+
+
+def check_lengths(lengths: Array, what: str) -> None:
+    """Reject measured lengths of which most are beyond 100 m, because these are probably in millimetres.
+
+    Args:
+        lengths: lengths of any shape [m]; nan where nothing was measured.
+        what: the name of the argument in the message.
+
+    Raises:
+        InputError: when more than half of the measured lengths are beyond 100 m.
+    """
+    far = int(np.count_nonzero(lengths > _FARTHEST))
+    if far and far > 0.5 * np.count_nonzero(~np.isnan(lengths)):
+        raise InputError(f"{what}: most of the measured lengths are beyond {_FARTHEST:g} m; give them in m, not in mm")
+
+
+def check_colors(colors: Array, what: str) -> None:
+    """Reject colours that are not from 0 to 1; nan is allowed.
+
+    Args:
+        colors: red, green and blue, shape (..., 3).
+        what: the name of the argument in the message.
+
+    Raises:
+        InputError: when a colour is out of range.
+    """
+    wrong = (colors < 0.0) | (colors > 1.0)
+    if wrong.any():
+        raise InputError(f"{what} must be from 0 to 1, got {colors[wrong][0]:g}; divide colours of 8 bits by 255")

@@ -17,6 +17,7 @@ from imitarm.validation import finite_array, instance, text
 Array = NDArray[np.float64]
 
 _FLOOR = 1e-18  # [m^2] smallest variance
+_LARGEST = 1e4  # [m^2] largest variance; positions are at most 100 m away
 _NEAREST = 1e-3  # [m] depth at which a camera's coordinates are still defined
 
 
@@ -41,8 +42,8 @@ class Detection:
         outline: label, kind and name of the obstacle in one text; empty for a convex hull.
 
     Raises:
-        InputError: when the obstacle is a half-space or is behind the camera, or the covariance is not symmetric and
-            positive semi-definite.
+        InputError: when the obstacle is a half-space or is behind the camera. Also when the covariance is not symmetric
+            and positive semi-definite, or is larger than 10 000 m^2.
     """
 
     obstacle: Obstacle
@@ -61,6 +62,8 @@ class Detection:
             raise InputError("Detection: a half-space has no centre to track; add it to the fixtures of the scene")
         covariance = np.array(finite_array(self.covariance, (3, 3), "Detection: covariance", "m^2"))
         scale = float(np.abs(covariance).max())
+        if scale > _LARGEST:
+            raise InputError(f"Detection: covariance must be at most {_LARGEST:g} m^2, got {scale:g}; give it in m^2")
         skewed = np.abs(covariance - covariance.T).max() > 1e-9 * scale
         if skewed or (scale > 0.0 and np.linalg.eigvalsh(covariance)[0] < -1e-9 * scale):
             raise InputError("Detection: covariance must be symmetric and positive semi-definite [m^2]")

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from imitarm.errors import InputError
 from imitarm.html_table import html_table
-from imitarm.validation import finite_array, finite_number, whole_number
+from imitarm.validation import finite_array, finite_number, finite_vector, whole_number
 
 Array = NDArray[np.float64]
 
@@ -107,7 +107,8 @@ class CoverageMargin:
         if shape is None:
             quarter = np.arange(len(errors)) % 4 == 0
             shape, errors = fitted_shape(errors[quarter], ahead, alpha), errors[~quarter]
-        a0, b0 = cls(*shape).offset, cls(*shape).growth
+        a0, b0 = finite_vector(shape, 2, "CoverageMargin: shape", "m, m/s").tolist()
+        cls(a0, b0)  # its checks
         scale = conformal_quantile(scores(errors, ahead, a0, b0), alpha)
         return cls(scale * a0, scale * b0)
 

@@ -126,7 +126,8 @@ class ObstacleDetector:
         max_obstacles: int = 32,
     ) -> None:
         self.arm = None if arm is None else instance(arm, ArmModel, "ObstacleDetector: arm")
-        self.surfaces = Scene(fixtures=tuple(surfaces)).fixtures
+        known = sequence(surfaces, Obstacle, "ObstacleDetector: surfaces")  # type: ignore[type-abstract]
+        self.surfaces = Scene(fixtures=known).fixtures
         self.find_table = flag(find_table, "ObstacleDetector: find_table")
         self.workspace = finite_array(workspace, (2, 3), "ObstacleDetector: workspace", "m").copy()
         if not (self.workspace[0] < self.workspace[1]).all():
@@ -142,15 +143,16 @@ class ObstacleDetector:
         self.voxel = finite_number(voxel, "ObstacleDetector: voxel", "m", above=0.0)
         self.gap = finite_number(gap, "ObstacleDetector: gap", "m", above=0.0)
         self.min_points = whole_number(min_points, "ObstacleDetector: min_points", at_least=1)
-        self.shapes = tuple(choice(shape, SHAPES, "shape to fit") for shape in shapes)
+        names = sequence(shapes, str, "ObstacleDetector: shapes")
+        self.shapes = tuple(choice(shape, SHAPES, "shape to fit") for shape in names)
         if not self.shapes:
             raise InputError("ObstacleDetector: shapes must name at least one shape")
         self.split = flag(split, "ObstacleDetector: split")
         self.targets = sequence(targets, Target, "ObstacleDetector: targets")
         self.max_obstacles = whole_number(max_obstacles, "ObstacleDetector: max_obstacles", at_least=1)
-        self.self_filter = (
-            None if arm is None else SelfFilter(arm, padding=padding, stamp_uncertainty=stamp_uncertainty)
-        )
+        padding = finite_number(padding, "ObstacleDetector: padding", "m", at_least=0.0)
+        delta = finite_number(stamp_uncertainty, "ObstacleDetector: stamp_uncertainty", "s", at_least=0.0)
+        self.self_filter = None if arm is None else SelfFilter(arm, padding=padding, stamp_uncertainty=delta)
 
     def record(self, stamp: float, q: ArrayLike) -> None:
         """Store the joint positions ``q`` (n_joints,) [rad] at ``stamp`` [s]; :meth:`detect` interpolates them."""
@@ -169,17 +171,7 @@ class ObstacleDetector:
             InputError: when ``frame`` is neither an image nor a point cloud, ``q`` has a wrong shape, or the detector
                 has an arm whose joint positions are unknown.
         """
-        if not isinstance(frame, DepthFrame | PointCloud):
-            raise InputError(f"detect: frame must be a DepthFrame or a PointCloud, got {frame!r}")
-        if self.self_filter is not None:
-            if q is not None:
-                self.self_filter.record(frame.stamp, q)
-            elif not self.self_filter.ready:
-                raise InputError(
-                    "detect: the joint positions of the arm are unknown, so its points can't be removed; give q, or "
-                    "call record(stamp, q) first"
-                )
-        measured, surfaces = self._obstacle_points(frame)
+        measured, surfaces = self._obstacle_points(_checked(frame, "detect"), q, "detect")
         if len(measured.points) < self.min_points:
             return []
         space = FreeSpace(frame if isinstance(frame, DepthFrame) else None, surfaces, self.noise.sigma)
@@ -192,9 +184,7 @@ class ObstacleDetector:
 
         The arguments have the same meaning as in :meth:`detect`.
         """
-        if q is not None:
-            self.record(frame.stamp, q)
-        return self._obstacle_points(frame)[0].points
+        return self._obstacle_points(_checked(frame, "obstacle_points"), q, "obstacle_points")[0].points
 
     def camera_error(self, frame: Frame) -> str:
         """Check the pose of the camera that the frame states; return a message about an error, or an empty string.
@@ -205,8 +195,11 @@ class ObstacleDetector:
 
         Args:
             frame: depth image or point cloud.
+
+        Raises:
+            InputError: when ``frame`` is neither an image nor a point cloud.
         """
-        measured = _measured(frame, self.depth_range)
+        measured = _measured(_checked(frame, "camera_error"), self.depth_range)
         if len(measured.points) < _ENOUGH:
             return ""
         chosen = np.linspace(0, len(measured.points) - 1, min(len(measured.points), _CHECKED)).astype(int)
@@ -249,7 +242,17 @@ class ObstacleDetector:
             "away from its known place; the camera was moved: calibrate the camera again"
         )
 
-    def _obstacle_points(self, frame: Frame) -> tuple[_Measured, tuple[Obstacle, ...]]:
+    def _obstacle_points(self, frame: Frame, q: ArrayLike | None, what: str) -> tuple[_Measured, tuple[Obstacle, ...]]:
+        """Return the points of obstacles, and the surfaces whose points were removed."""
+        if self.self_filter is None and q is not None:
+            raise InputError(f"{what}: q was given, but the detector has no arm; make it with arm=ArmModel.load(...)")
+        if self.self_filter is not None and q is not None:
+            self.self_filter.record(frame.stamp, q)
+        elif self.self_filter is not None and not self.self_filter.ready:
+            raise InputError(
+                f"{what}: the joint positions of the arm are unknown, so its points can't be removed; give q, or call "
+                "record(stamp, q) first"
+            )
         measured = _measured(frame, self.depth_range)
         low, high = self.workspace
         measured = measured.only(((measured.points >= low) & (measured.points <= high)).all(axis=1))
@@ -361,6 +364,12 @@ def _take(measured: _Measured, group: NDArray[np.intp]) -> _Measured:
     chosen = np.zeros(len(measured.points), dtype=bool)
     chosen[group] = True
     return measured.only(chosen)
+
+
+def _checked(frame: Frame, what: str) -> Frame:
+    if not isinstance(frame, DepthFrame | PointCloud):
+        raise InputError(f"{what}: frame must be a DepthFrame or a PointCloud, got {frame!r}")
+    return frame
 
 
 def _measured(frame: Frame, depth_range: tuple[float, float]) -> _Measured:

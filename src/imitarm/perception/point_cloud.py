@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from imitarm.html_table import html_table
 from imitarm.kinematics.pose import Pose
-from imitarm.validation import finite_number, instance, real_array
+from imitarm.perception.depth_frame import check_colors, check_lengths
+from imitarm.validation import finite_number, instance, real_array, time_stamp
 
 Array = NDArray[np.float64]
 
@@ -27,7 +28,8 @@ class PointCloud:
         colors: red, green and blue of each point, 0 to 1, shape (n, 3); None without colours.
 
     Raises:
-        InputError: when a shape is wrong, or the stamp or the spacing is not a finite number.
+        InputError: when a shape is wrong, or the stamp or the spacing is not a finite number. Also when most points are
+            beyond 100 m, as in millimetres, or a colour is not from 0 to 1.
     """
 
     stamp: float
@@ -38,14 +40,16 @@ class PointCloud:
 
     def __post_init__(self) -> None:
         instance(self.sensor_to_base, Pose, "PointCloud: sensor_to_base")
-        object.__setattr__(self, "stamp", finite_number(self.stamp, "PointCloud: stamp", "s"))
+        object.__setattr__(self, "stamp", time_stamp(self.stamp, "PointCloud: stamp"))
         object.__setattr__(self, "spacing", finite_number(self.spacing, "PointCloud: spacing", "rad", above=0.0))
         measured = real_array(self.measured, (None, 3), "PointCloud: measured", "m")
         finite = np.isfinite(measured).all(axis=1)
         if self.colors is not None:
             colors = real_array(self.colors, (len(measured), 3), "PointCloud: colors")[finite]
+            check_colors(colors, "PointCloud: colors")
             object.__setattr__(self, "colors", colors)
         measured = measured[finite]
+        check_lengths(np.abs(measured).max(axis=1, initial=0.0), "PointCloud: measured")
         measured.setflags(write=False)
         object.__setattr__(self, "measured", measured)
 

@@ -20,7 +20,7 @@ from imitarm.perception.rotation_rate import Rates, turned, turned_on
 from imitarm.perception.track_memory import ALL_SEEN, IN_ORDER, TrackMemory, obstacles, renewed, updated
 from imitarm.perception.tracks import UNCONFIRMED, TrackedObstacle, Tracks, smoothed_sizes
 from imitarm.scene import Obstacle, Scene
-from imitarm.validation import finite_number, instance, sequence, whole_number
+from imitarm.validation import finite_number, instance, sequence, time_stamp, whole_number
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -172,7 +172,7 @@ class ObstacleTracker:
                 ``detections`` is not a detection, or there are more than ``max_obstacles`` detections. The tracks are
                 then not changed.
         """
-        stamp = finite_number(stamp, "ObstacleTracker.update: stamp", "s")
+        stamp = time_stamp(stamp, "ObstacleTracker.update: stamp")
         found = sequence(detections, Detection, "ObstacleTracker.update: detections")
         if len(found) > self.max_obstacles:
             raise InputError(
@@ -202,7 +202,9 @@ class ObstacleTracker:
         Raises:
             InputError: when an argument is invalid.
         """
-        time = finite_number(time, "ObstacleTracker.scene: time", "s")
+        time = time_stamp(time, "ObstacleTracker.scene: time")
+        if type(fixtures) is not tuple:
+            fixtures = sequence(fixtures, Obstacle, "ObstacleTracker.scene: fixtures")  # type: ignore[type-abstract]
         if not self._steps:
             return Scene(goal, (), time, tuple(fixtures))
         tracks = self._steps[-1].tracks

@@ -24,7 +24,7 @@ from imitarm.policies.replanning import replan
 from imitarm.policies.stopping import Stop, certified_stop
 from imitarm.scene.scene import Scene
 from imitarm.skills.skill import Skill
-from imitarm.validation import finite_number, whole_number
+from imitarm.validation import finite_number, instance, whole_number
 
 Array = NDArray[np.float64]
 
@@ -177,6 +177,7 @@ class CertifiedRCAMO(Policy):
             InfeasibleError: when obstacles at rest or the limits of the arm make the motion impossible; the message
                 gives the reason.
         """
+        instance(observation, Observation, "CertifiedRCAMO.reset: observation")
         self.plans = self.certified = 0
         self._goal = observation.scene.goal
         self._plan: PlanInExecution | None = None
@@ -233,8 +234,10 @@ class CertifiedRCAMO(Policy):
         """Return the command that follows the certified plan, brakes, or evades without a guarantee.
 
         Raises:
-            InputError: when ``reset`` was not called, or the goal has moved.
+            InputError: when ``reset`` was not called, the goal has moved, or ``dt`` is not a positive number.
         """
+        instance(observation, Observation, "CertifiedRCAMO.step: observation")
+        dt = finite_number(dt, "CertifiedRCAMO.step: dt", "s", above=0.0)
         if not self._started:
             raise InputError("CertifiedRCAMO.step: call reset(observation) first")
         time, scene = observation.time, self._velocities.improved(observation.scene.now(observation.time))

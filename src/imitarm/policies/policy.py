@@ -81,11 +81,18 @@ class Policy(ABC):
     ) -> None:
         self.arm = None if arm is None else instance(arm, ArmModel, "Policy: arm")
         self.skill = instance(skill, Skill, "Policy: skill")
+        _ = self.skill.duration_  # an unfitted skill has none, and says so
         self.tool_spheres = (
             None if tool_spheres is None else finite_array(tool_spheres, (None, 4), "Policy: tool_spheres", "m")
         )
+        if self.tool_spheres is not None and (self.tool_spheres[:, 3] < 0.0).any():
+            raise InputError("Policy: tool_spheres has a negative radius [m]; each row is x y z r")
         self.clearance = finite_number(clearance, "Policy: clearance", "m", at_least=0.0)
         self.forbidden = forbidden
+        if np.size(directions := finite_array(forbidden, (...,), "Policy: forbidden")):
+            rows = np.atleast_2d(finite_array(directions, (..., 3), "Policy: forbidden"))
+            if not rows.any(axis=-1).all():
+                raise InputError("Policy: forbidden has a direction of length 0; leave it out")
 
     @classmethod
     def build(cls, skill: Skill, **options: Any) -> Self:

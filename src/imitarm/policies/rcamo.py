@@ -157,6 +157,7 @@ class RCAMO(Policy):
 
     def reset(self, observation: Observation) -> None:
         """Start the motion at the measured pose of the tool."""
+        instance(observation, Observation, "RCAMO.reset: observation")
         away = observation.tool_to_base.error_to(self.skill.start_)
         if not self.skill.gmr_.has_orientation_:
             away = away[:3]
@@ -219,8 +220,10 @@ class RCAMO(Policy):
         """Return the command of least predicted cost.
 
         Raises:
-            InputError: when neither ``reset`` nor ``resume`` was called.
+            InputError: when neither ``reset`` nor ``resume`` was called, or ``dt`` is not a positive number.
         """
+        instance(observation, Observation, "RCAMO.step: observation")
+        dt = finite_number(dt, "RCAMO.step: dt", "s", above=0.0)
         path = self._followed(observation)
         x = observation.tool_to_base.position
         reference = path.position(self._phase) + self._deviation[0]
