@@ -61,7 +61,9 @@ def arm():
 @pytest.fixture(scope="module")
 def skill():
     u = np.linspace(0.0, 1.0, 60)
-    paths = [np.column_stack([0.4 + 0.2 * u, 0.02 * i * np.sin(np.pi * u), 0.4 + 0.0 * u]) for i in range(3)]
+    paths = [
+        np.column_stack([0.4 + 0.2 * u, 0.02 * i * np.sin(np.pi * u), 0.4 + 0.03 * np.sin(3.0 * u)]) for i in range(3)
+    ]
     return Skill(3).fit([Demonstration(Trajectory(2.0 * u, path)) for path in paths])
 
 
