@@ -159,7 +159,7 @@ def packaged(folder, robot="sawyer"):
 def test_the_packaged_skill_is_used_with_the_named_arms(options, expected, monkeypatch):
     used = []
     monkeypatch.setattr(placements, "run_placements", lambda policies, setups, *_, **__: used.extend(setups) or [])
-    monkeypatch.setattr("imitarm.cli.benchmark.placement_tables", lambda results: [])
+    monkeypatch.setattr("imitarm.cli.benchmark_placements.placement_tables", lambda results: [])
     assert cli.main(["benchmark", "placements", "--seeds", "1", *options]) in (0, 1)
     assert [(setup.robot, setup.tool) for setup in used] == expected
 

@@ -99,7 +99,7 @@ class MappingBenchmark:
                 for method in self.methods
                 if method in MAIN
             ]
-        return found
+        return list(dict.fromkeys(found))
 
 
 class ResultFolder(Store[Experiment, Result]):

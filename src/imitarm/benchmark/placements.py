@@ -266,7 +266,9 @@ def run_placements(
             is not installed.
         FileFormatError: when ``out`` contains something other than results.
     """
-    work = [Run(policy, setup, seed, max_tilt) for setup in setups for seed in seeds for policy in policies]
+    work = list(
+        dict.fromkeys(Run(policy, setup, s, max_tilt) for setup in setups for s in seeds for policy in policies)
+    )
     known: dict[Run, PlacementResult] = {}
     if out is not None and out.exists():
         repaired(out)

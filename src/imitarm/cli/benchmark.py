@@ -4,37 +4,32 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-import math
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from imitarm.benchmark import avoidance, placement_comparison, placements, real_motions, refusals, repeated_tasks
+from imitarm.benchmark import avoidance, real_motions, refusals, repeated_tasks
 from imitarm.benchmark.experiment import METHODS, Result
 from imitarm.benchmark.mapping import MappingBenchmark, run_all, tables, write_tables
 from imitarm.benchmark.mapping_tables import TEST, Results
-from imitarm.benchmark.placement_results import Setup, load_results
-from imitarm.benchmark.placement_tables import placement_tables
 from imitarm.benchmark.provenance import code_version, origin
 from imitarm.benchmark.recordings import KINDS
 from imitarm.benchmark.refusal_proof import Answer
 from imitarm.benchmark.repeated_tasks import REPEATED_TASKS, RepeatedTask
 from imitarm.cli.benchmark_moving import add_moving
-from imitarm.cli.benchmark_options import add_fill, add_workers, place_of, report_tables, workers_of
+from imitarm.cli.benchmark_options import add_fill, add_saved, add_workers, place_of, report_tables, workers_of
 from imitarm.cli.benchmark_perception import add_perception
+from imitarm.cli.benchmark_placements import add_placements
 from imitarm.cli.benchmark_real_time import add_real_time
 from imitarm.cli.benchmark_static import add_static
 from imitarm.cli.benchmark_tracking import add_tracking
 from imitarm.cli.outputs import check_outputs, same_place
-from imitarm.cli.robot_options import add_robot_options
 from imitarm.cli.run_scene import provenance
 from imitarm.cli.screen import progress_bar, remark, say
 from imitarm.errors import InputError
-from imitarm.policies import POLICIES
 from imitarm.policies.adaptation import ADAPTERS
 
-OTHERS = (add_static, add_moving, add_tracking, add_perception, add_real_time)
+OTHERS = (add_placements, add_static, add_moving, add_tracking, add_perception, add_real_time)
 """Functions that add the subcommands whose code is in another module."""
 
 EPILOG = """\
@@ -46,7 +41,7 @@ examples:
   imitarm benchmark avoidance --seeds 200
   imitarm benchmark placements --skill pour.json --robot panda --tool gripper --seeds 100
   imitarm benchmark placements --skill pour.json shelf.json --robots sawyer panda --tool gripper --jobs 2
-  imitarm benchmark placements --policies acfra rrt-connect --max-tilt 30 --out placements.jsonl
+  imitarm benchmark placements --skill pour.json --policies acfra rrt-connect --out placements.jsonl
   imitarm benchmark comparison placements.jsonl
   imitarm benchmark packing --seeds 100 --out packing
   imitarm benchmark pushed-cube --observer camera --seeds 20
@@ -111,12 +106,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     mapping.add_argument("--out", type=Path, metavar="DIR", help="folder of the results; default: benchmark-mapping")
     mapping.add_argument("--report", type=Path, metavar="FILE", help="write a page with figures and playback (HTML)")
     add_fill(mapping)
-    mapping.add_argument("--fresh", action="store_true", help="ignore saved results and run all experiments again")
-    mapping.add_argument(
-        "--reuse",
-        action="store_true",
-        help="use saved results of the same configuration even if another version of the code computed them",
-    )
+    add_saved(mapping)
     add_workers(mapping)
     mapping.set_defaults(benchmark=_mapping)
     other = parsers.add_parser("avoidance", help="measure how often each method keeps its clearance in random scenes")
@@ -138,7 +128,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     third.add_argument("--skills", type=Path, nargs="+", default=[], metavar="FILE", help="additional skills to adapt")
     add_fill(third)
     third.set_defaults(benchmark=_refusals)
-    _add_placements(parsers)
     for name, task in REPEATED_TASKS.items():
         _add_repeated(parsers, name, task)
     for add in OTHERS:
@@ -153,54 +142,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     people.add_argument("videos", nargs="*", metavar="VIDEO", help="videos or recordings of a person")
     add_fill(people)
     people.set_defaults(benchmark=_people)
-
-
-def _add_placements(parsers: Any) -> None:
-    placed = parsers.add_parser(
-        "placements", help="compare policies on a simulated arm with randomly placed obstacles on the path"
-    )
-    placed.add_argument(
-        "--skill",
-        type=Path,
-        nargs="+",
-        metavar="FILE",
-        help="skill files; default: the skill 'sweep' of the package, with the brush as default tool",
-    )
-    placed.add_argument("--robots", nargs="+", metavar="NAME", help="names of several arms, instead of --robot")
-    placed.add_argument("--policies", nargs="+", choices=POLICIES, default=["acfra"], metavar="NAME")
-    placed.add_argument("--seeds", type=int, default=50, metavar="N", help="number of placements; default: 50")
-    placed.add_argument("--first", type=int, default=2000, metavar="N", help="first seed; default: 2000")
-    placed.add_argument("--jobs", type=int, default=1, metavar="N", help="number of processes; default: 1")
-    placed.add_argument(
-        "--list", action="store_true", help="also list each placement in which a policy did not reach the goal"
-    )
-    placed.add_argument(
-        "--out",
-        type=Path,
-        metavar="FILE",
-        help="append each result to this file (JSON lines); results that are already in it are not measured again",
-    )
-    placed.add_argument(
-        "--reuse", action="store_true", help="use results in --out even if another version of the code measured them"
-    )
-    add_robot_options(placed)
-    add_fill(placed)
-    placed.add_argument(
-        "--max-tilt", type=float, metavar="DEG", help="largest tilt of the tool; default: as in the demonstrations"
-    )
-    placed.set_defaults(benchmark=_placements)
-    compared = parsers.add_parser(
-        "comparison",
-        help="read saved results, and compare one policy with each other policy where the other one succeeded",
-    )
-    compared.add_argument(
-        "results", type=Path, nargs="+", metavar="RESULTS", help="files that 'placements --out' wrote"
-    )
-    compared.add_argument(
-        "--policy", choices=POLICIES, default="acfra", metavar="NAME", help="policy to compare; default: acfra"
-    )
-    add_fill(compared)
-    compared.set_defaults(benchmark=_comparison)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -266,7 +207,7 @@ def _avoidance(arguments: argparse.Namespace) -> int:
         table = avoidance.success_table(
             arguments.seeds,
             arguments.first,
-            arguments.methods,
+            list(dict.fromkeys(arguments.methods)),
             on_done=lambda finished, of: bar.update(task, completed=finished, total=of),
         )
     report_tables([table], place, [code_version()])
@@ -317,6 +258,10 @@ def _add_repeated(parsers: Any, name: str, task: RepeatedTask) -> None:
 
 def _repeated(arguments: argparse.Namespace) -> int:
     """Run a task with many seeds and print its table."""
+    if arguments.seeds < 1 or arguments.first < 0:
+        raise InputError(
+            f"--seeds must be at least 1 and --first at least 0, got {arguments.seeds} and {arguments.first}"
+        )
     place = place_of(arguments, arguments.task)
     with progress_bar() as progress:
         bar = progress.add_task(arguments.task, total=arguments.seeds)
@@ -330,47 +275,6 @@ def _repeated(arguments: argparse.Namespace) -> int:
             on_done=lambda done, total: progress.update(bar, completed=done, total=total),
         )
     report_tables(repeated_tasks.success_tables(results), place, [result.code for result in results])
-    return 0
-
-
-def _placements(arguments: argparse.Namespace) -> int:
-    """Run the placements benchmark and print its table."""
-    if arguments.seeds < 1 or arguments.first < 0 or arguments.jobs < 1:
-        raise InputError("--seeds and --jobs must be at least 1, and --first at least 0")
-    if arguments.out is not None and arguments.skill is None:
-        raise InputError("--out needs --skill, because the default skill is not a file")
-    place = place_of(arguments, "placements")
-    with tempfile.TemporaryDirectory() as folder, progress_bar() as bar:
-        skills, tool = arguments.skill, arguments.tool
-        if skills is None:
-            skills, tool = [placements.packaged_skill(Path(folder))], tool or "brush"
-        robots = arguments.robots or [arguments.robot]
-        setups = [Setup(str(skill), arm, tool) for skill in skills for arm in robots]
-        task = bar.add_task("reproducing", total=None)
-        results = placements.run_placements(
-            arguments.policies,
-            setups,
-            range(arguments.first, arguments.first + arguments.seeds),
-            max_tilt=None if arguments.max_tilt is None else math.radians(arguments.max_tilt),
-            jobs=arguments.jobs,
-            out=arguments.out,
-            reuse=arguments.reuse,
-            progress=lambda done, of: bar.update(task, completed=done, total=of),
-        )
-    report_tables(placement_tables(results), place, [result.code for result in results])
-    for result in results if arguments.list else []:
-        if result.outcome != "arrived":
-            where = f"{Path(result.setup.skill).stem}, {result.setup.robot}, seed {result.seed}"
-            say(f"{result.policy}, {where}: {result.outcome}: {result.reason}")
-    return 0
-
-
-def _comparison(arguments: argparse.Namespace) -> int:
-    """Compare a policy with the other policies, from saved results of placements, and print the comparison."""
-    place = place_of(arguments, "comparison")
-    results = list(load_results(arguments.results).values())
-    tables_found = placement_comparison.comparison_tables(results, arguments.policy)
-    report_tables(tables_found, place, [result.code for result in results])
     return 0
 
 
@@ -417,6 +321,12 @@ def _given(value: int | None, otherwise: int) -> int:
 
 def _check(arguments: argparse.Namespace, folder: Path) -> None:
     """Check the options now, because a wrong option would otherwise fail only after the long run."""
+    if arguments.no_replay:
+        for option in ("kinds", "data"):
+            if getattr(arguments, option):
+                raise InputError(
+                    f"--{option} selects recordings, but --no-replay leaves them out; give only one of them"
+                )
     workers_of(arguments)
     if arguments.data is not None and not arguments.data.is_dir():
         raise InputError(f"--data {arguments.data}: there is no such folder")

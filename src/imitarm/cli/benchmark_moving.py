@@ -15,9 +15,20 @@ from imitarm.benchmark.moving_tables import family_table, moving_tables, success
 from imitarm.benchmark.person_arm import DATA, has_recordings
 from imitarm.benchmark.provenance import code_version, origin
 from imitarm.benchmark.static_scenes import SPLITS
-from imitarm.cli.benchmark_options import add_fill, add_workers, place_of, report_tables, run_with_progress, workers_of
+from imitarm.cli.benchmark_options import (
+    Actions,
+    add_fill,
+    add_saved,
+    add_workers,
+    place_of,
+    report_tables,
+    run_with_progress,
+    scenes_to_play,
+    workers_of,
+)
 from imitarm.cli.outputs import check_outputs
 from imitarm.cli.screen import remark, say
+from imitarm.control_loop.observer import SensorModel
 from imitarm.errors import InputError
 
 _FOLDER = Path("benchmark-moving")
@@ -50,7 +61,9 @@ def add_moving(parsers: Any) -> None:
         help="sensor: the positions of the obstacles, with noise (the default); "
         "camera: two simulated depth cameras, only with --world sawyer panda",
     )
-    moving.add_argument("--dimensions", nargs="+", type=int, choices=(2, 3), default=[2, 3], help="default: 2 3")
+    moving.add_argument(
+        "--dimensions", nargs="+", type=int, choices=(2, 3), help="dimensions of the world 'tool'; default: 2 3"
+    )
     moving.add_argument(
         "--count",
         type=int,
@@ -80,11 +93,12 @@ def add_moving(parsers: Any) -> None:
     moving.add_argument(
         "--out", type=Path, default=_FOLDER, metavar="DIR", help=f"folder of results; default: {_FOLDER}"
     )
-    moving.add_argument("--fresh", action="store_true", help="ignore saved results and run all experiments again")
-    moving.add_argument("--reuse", action="store_true", help="use saved results of another version of the code")
+    add_saved(moving)
     add_workers(moving)
     moving.set_defaults(benchmark=_run)
-    actions = moving.add_subparsers(metavar="ACTION", title="actions; if none is given, the experiments are run")
+    actions = moving.add_subparsers(
+        action=Actions, metavar="ACTION", title="actions; if none is given, the experiments are run"
+    )
     comparison = actions.add_parser("compare", help="print the tables of saved results")
     comparison.add_argument("folders", type=Path, nargs="+", metavar="FOLDER", help="folders of results")
     comparison.add_argument("--report", type=Path, metavar="FILE", help="write a page with figures and playback (HTML)")
@@ -106,6 +120,8 @@ def experiments_of(arguments: argparse.Namespace) -> list[MovingExperiment]:
         raise InputError(
             f"--count must be at least 1 and --first at least 0, got {arguments.count} and {arguments.first}"
         )
+    if arguments.dimensions and "tool" not in arguments.world:
+        raise InputError("--dimensions applies only to --world tool; the worlds with an arm have 3 dimensions")
     families = list(arguments.families or FAMILIES)
     if not arguments.families and not has_recordings():
         families.remove(_RECORDED)
@@ -119,16 +135,22 @@ def experiments_of(arguments: argparse.Namespace) -> list[MovingExperiment]:
             arguments.occlusions,
         )
     )
+    for sensor in sensors:
+        try:
+            SensorModel(*sensor)
+        except InputError as error:
+            raise InputError(f"--noise, --rate, --latency, --dropout or --occlusions: {error}") from error
     seeds = range(arguments.first, arguments.first + arguments.count)
-    return [
+    found = [
         MovingExperiment(family, dimension, seed, method, (), world, *sensor, arguments.observer)
         for seed in seeds
         for family in families
         for world in arguments.world
-        for dimension in (arguments.dimensions if world == "tool" else [3])
+        for dimension in (arguments.dimensions or [2, 3] if world == "tool" else [3])
         for sensor in sensors
-        for method in dict.fromkeys(arguments.methods or default_methods(world))
+        for method in arguments.methods or default_methods(world)
     ]
+    return list(dict.fromkeys(found))
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -148,6 +170,7 @@ def _run(arguments: argparse.Namespace) -> int:
 def _compare(arguments: argparse.Namespace) -> int:
     """Print the tables of saved results, and write files."""
     check_outputs([("--report", arguments.report)], [("--fill", arguments.fill)], new_folders=True)
+    chosen = scenes_to_play(arguments, "M3,3,2004")
     found = RESULTS.read_folders(arguments.folders)
     results, versions = MovingResults(found), [r.code for r in found]
     place = place_of(arguments, "moving" if "tool" in results.settings else _WITH_ARM)
@@ -159,14 +182,5 @@ def _compare(arguments: argparse.Namespace) -> int:
         from imitarm.cli.run_scene import provenance  # noqa: PLC0415
 
         facts = provenance(results=origin(versions), experiments=len(found))
-        chosen = [_scene(text) for text in arguments.play]
         say(f"wrote {write_moving_report(results, arguments.report, provenance=facts, scenes=chosen)}")
     return 0
-
-
-def _scene(text: str) -> tuple[str, int, int]:
-    try:
-        family, dimension, seed = text.split(",")
-        return family, int(dimension), int(seed)
-    except ValueError as error:
-        raise InputError(f"--play {text}: write family, dimension and seed, such as M3,3,2004") from error

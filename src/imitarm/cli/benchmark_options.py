@@ -9,12 +9,82 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic
+from typing import Any, Generic
 
 from imitarm.benchmark.running import LOCAL, Outcome, Store, Work, Workers, run_experiments
 from imitarm.benchmark.tables import Place, Table
 from imitarm.cli.screen import progress_bar, say, show_table
 from imitarm.errors import InputError
+
+
+class Actions(argparse._SubParsersAction):  # type: ignore[type-arg]
+    """The actions of a benchmark. An option before an action is an error, because the action would ignore the option.
+
+    Use it as ``parser.add_subparsers(action=Actions)``.
+    """
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        """Check the options before the action, then read the action."""
+        given = [
+            option.option_strings[0]
+            for option in parser._actions
+            if option.option_strings and getattr(namespace, option.dest, option.default) != option.default
+        ]
+        if given:
+            raise InputError(
+                f"{' '.join(given)}: an option before '{values[0]}' has no effect; leave it out, or write it after "
+                f"'{values[0]}' if 'imitarm benchmark ... {values[0]} --help' lists it"
+            )
+        super().__call__(parser, namespace, values, option_string)
+
+
+def add_saved(parser: argparse.ArgumentParser) -> None:
+    """Add the two options that say which saved results are used; only one of them can be given."""
+    saved = parser.add_mutually_exclusive_group()
+    saved.add_argument("--fresh", action="store_true", help="ignore saved results and run all experiments again")
+    saved.add_argument(
+        "--reuse",
+        action="store_true",
+        help="use saved results of the same experiments even if another version of the code computed them",
+    )
+
+
+def scene_to_play(text: str, example: str) -> tuple[str, int, int]:
+    """Return family, dimension and seed of a scene that ``--play`` names.
+
+    Args:
+        text: the argument of the option.
+        example: a correct argument, for the message.
+
+    Raises:
+        InputError: when the text does not have this form.
+    """
+    try:
+        family, dimension, seed = text.split(",")
+        return family, int(dimension), int(seed)
+    except ValueError as error:
+        raise InputError(f"--play {text}: write family, dimension and seed, such as {example}") from error
+
+
+def scenes_to_play(arguments: argparse.Namespace, example: str) -> list[tuple[str, int, int]]:
+    """Return the scenes that ``--play`` names.
+
+    Args:
+        arguments: the parsed arguments ``play`` and ``report``.
+        example: a correct argument, for the message.
+
+    Raises:
+        InputError: when a scene is not named correctly, or there is no report to draw it in.
+    """
+    if arguments.play and arguments.report is None:
+        raise InputError("--play draws scenes in the page of --report; name this page with --report FILE")
+    return [scene_to_play(text, example) for text in arguments.play]
 
 
 def add_workers(parser: argparse.ArgumentParser) -> None:

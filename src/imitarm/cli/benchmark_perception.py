@@ -42,7 +42,7 @@ def _run(arguments: argparse.Namespace) -> int:
         frames = run_frames(
             arguments.count,
             arguments.first,
-            families=arguments.families,
+            families=list(dict.fromkeys(arguments.families)),
             noise=DepthNoise.none() if arguments.exact else None,
             height=arguments.height,
             on_done=lambda done, of: bar.update(task, completed=done, total=of),

@@ -27,12 +27,15 @@ from imitarm.benchmark.static_scenes import ANY_SKILL, FAMILIES, SPLITS, static_
 from imitarm.benchmark.static_tables import ORACLE, OURS, StaticResults, checked_refusals_table, success_table
 from imitarm.benchmark.static_tuning import DRAWS, Search, tune, tuned_options, write_tuned
 from imitarm.cli.benchmark_options import (
+    Actions,
     add_fill,
+    add_saved,
     add_workers,
     command_line,
     place_of,
     report_tables,
     run_with_progress,
+    scenes_to_play,
     workers_of,
 )
 from imitarm.cli.outputs import check_outputs
@@ -87,7 +90,9 @@ def add_static(parsers: Any) -> None:
     )
     _add_running(static)
     static.set_defaults(benchmark=_run)
-    actions = static.add_subparsers(metavar="ACTION", title="actions; if none is given, the experiments are run")
+    actions = static.add_subparsers(
+        action=Actions, metavar="ACTION", title="actions; if none is given, the experiments are run"
+    )
     tuning = actions.add_parser("tune", help="search for the best options of each method on validation scenes")
     solvable = [family for family in FAMILIES if family != COVERED]  # no draw could succeed in the others
     _add_scenes(tuning, count=5, split="validation", families=solvable)
@@ -178,8 +183,7 @@ def _add_running(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, default=_FOLDER, metavar="DIR", help=f"folder of results; default: {_FOLDER}"
     )
-    parser.add_argument("--fresh", action="store_true", help="ignore saved results and run all experiments again")
-    parser.add_argument("--reuse", action="store_true", help="use saved results of another version of the code")
+    add_saved(parser)
     add_workers(parser)
 
 
@@ -187,7 +191,8 @@ def _scenes(arguments: argparse.Namespace) -> list[tuple[str, int, int]]:
     if arguments.count < 1 or arguments.first < 0:
         raise InputError(f"--count must be at least 1 and --first at least 0: {arguments.count}, {arguments.first}")
     seeds = range(arguments.first, arguments.first + arguments.count)
-    return [(family, d, seed) for seed in seeds for family in arguments.families for d in arguments.dimensions]
+    found = [(family, d, seed) for seed in seeds for family in arguments.families for d in arguments.dimensions]
+    return list(dict.fromkeys(found))
 
 
 def experiments_of(arguments: argparse.Namespace) -> list[StaticExperiment]:
@@ -336,6 +341,7 @@ def _compare(arguments: argparse.Namespace) -> int:
     place = place_of(arguments, "static")
     outputs = [("--report", arguments.report), ("--json", arguments.json), ("--markdown", arguments.markdown)]
     check_outputs([outputs[0]], [("--fill", arguments.fill), *outputs[1:]], new_folders=True)
+    chosen = scenes_to_play(arguments, "S5,3,2004")
     found = RESULTS.read_folders(arguments.folders)
     results, versions = StaticResults(found), [r.code for r in found]
     tables = static_tables(results)
@@ -361,14 +367,5 @@ def _compare(arguments: argparse.Namespace) -> int:
         from imitarm.cli.run_scene import provenance  # noqa: PLC0415
 
         facts = provenance(results=origin(versions), experiments=len(found))
-        chosen = [_scene(text) for text in arguments.play]
         say(f"wrote {write_static_report(results, tables, arguments.report, provenance=facts, scenes=chosen)}")
     return 0
-
-
-def _scene(text: str) -> tuple[str, int, int]:
-    try:
-        family, dimension, seed = text.split(",")
-        return family, int(dimension), int(seed)
-    except ValueError as error:
-        raise InputError(f"--play {text}: write family, dimension and seed, such as S5,3,2004") from error

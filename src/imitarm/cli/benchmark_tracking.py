@@ -54,7 +54,10 @@ def _run(arguments: argparse.Namespace) -> int:
     check_outputs([("--report", arguments.report)], [("--fill", arguments.fill)])
     if arguments.windows < 200:
         raise InputError(f"--windows must be at least 200, got {arguments.windows}")
-    sensor = replace(SENSOR, noise=1e-3 * arguments.noise, dropout=0.01 * arguments.dropout, seed=arguments.seed)
+    try:
+        sensor = replace(SENSOR, noise=1e-3 * arguments.noise, dropout=0.01 * arguments.dropout, seed=arguments.seed)
+    except InputError as error:
+        raise InputError(f"--noise, --dropout or --seed: {error}") from error
     motions = [] if arguments.data is None else recorded_motions(arguments.data)
     if not motions:
         remark("real motion is left out, because it needs real recordings; name their folder with --data")

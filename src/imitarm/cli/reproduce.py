@@ -46,6 +46,7 @@ The exit status is 1 if no path keeps the clearance, if the arm touched somethin
 """
 
 _NEAREST_CAMERA = 0.7  # [m] from the middle of the path
+_FARTHEST_CAMERA = 4.5  # [m] likewise; obstacles behind the path are then still within the 5 m that the camera measures
 _AROUND = 0.5  # [m] obstacles are searched so far around the learned path
 FORBIDDEN = {"keep_height": HORIZONTAL_ONLY, "not_down": NOT_DOWN}
 
@@ -214,6 +215,11 @@ def _observer(
             raise InputError(
                 f"--camera: {1e2 * np.linalg.norm(middle - eye):.0f} cm from the learned path is too near; the camera "
                 f"measures only depths above 50 cm, so place it at least {1e2 * _NEAREST_CAMERA:.0f} cm away"
+            )
+        if np.linalg.norm(middle - eye) > _FARTHEST_CAMERA:
+            raise InputError(
+                f"--camera: {np.linalg.norm(middle - eye):.1f} m from the learned path is too far; the camera measures "
+                f"only depths up to 5 m, so place it at most {_FARTHEST_CAMERA:g} m away. Its position is in cm"
             )
         workspace = (path.min(axis=0) - _AROUND, path.max(axis=0) + _AROUND)
         surfaces, goal = scene.fixtures, scene.goal
