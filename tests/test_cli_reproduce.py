@@ -212,6 +212,8 @@ def test_a_camera_sees_what_the_policy_evades(sweep, tmp_path, capsys):
     assert "no contact in 1 of 1 scenes with obstacles" in capsys.readouterr().out
     assert main([*command, "--camera", "70", "0", "30"]) == 2
     assert "--camera: 3" in capsys.readouterr().err
+    assert main([*command, "--camera", "1e9", "0", "95"]) == 2
+    assert "m from the learned path is too far" in capsys.readouterr().err
 
 
 def test_a_camera_that_looks_away_from_the_obstacle_does_not_save_the_arm(sweep, tmp_path, monkeypatch, capsys):
