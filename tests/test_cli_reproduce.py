@@ -162,6 +162,22 @@ def test_tilts_concern_the_plan_of_the_whole_arm(sweep, capsys):
         assert f"{option} applies only to a plan of the whole arm" in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ("--policy rcamo --max-tilt 10", "--max-tilt: the policy rcamo has no such option"),
+        ("--policy rcamo --goal-tilt 10", "--goal-tilt: the policy rcamo has no such option"),
+        ("--clearance -5", "--clearance must be a finite number of at least 0 [mm], got -5.0"),
+        ("--tool-radius nan", "--tool-radius must be a finite number of at least 0 [mm]"),
+        ("--goal nan 0 0", "--goal must be finite [cm]"),
+        ("--start 0 inf 0", "--start must be finite [cm]"),
+    ],
+)
+def test_options_without_effect_or_meaning_are_named(sweep, options, said, capsys):
+    assert main(["reproduce", str(sweep), *options.split()]) == 2
+    assert said in " ".join(capsys.readouterr().err.split())
+
+
 def test_a_scene_begins_at_its_stamp(sweep, tmp_path, capsys):
     """A ball that was on the path ten seconds before the stamp of the file is out of the way now."""
     scene = tmp_path / "scene.yaml"

@@ -28,7 +28,7 @@ from imitarm.scene import MovingScene, Scene, load_moving_scene, standard_fixtur
 from imitarm.skills import Skill
 from imitarm.tasks.watching import delayed, watched
 from imitarm.trajectory import Demonstration
-from imitarm.validation import finite_number
+from imitarm.validation import finite_number, finite_vector
 from imitarm.viewer import Report, write_report
 
 EPILOG = """\
@@ -153,6 +153,7 @@ def run(arguments: argparse.Namespace) -> int:
         *robot_files(arguments),
     ]
     check_outputs([("--out", arguments.out), ("--report", arguments.report)], inputs, force=arguments.force)
+    _check_numbers(arguments)
     skill = Skill.load(arguments.skill)
     arm = load_robot(arguments)
     tracked = MovingScene(Scene()) if arguments.scene is None else load_moving_scene(arguments.scene).from_stamp()
@@ -251,6 +252,8 @@ def _policy(arguments: argparse.Namespace, skill: Skill, arm: ArmModel, spheres:
                 raise InputError(
                     f"{option} applies only to a plan of the whole arm: leave out --tool-only and --tool-radius"
                 )
+            if not POLICIES[arguments.policy].takes(name):
+                raise InputError(f"{option}: the policy {arguments.policy} has no such option; leave it out")
             options[name] = math.radians(finite_number(value, option, "degrees", at_least=0.0))
     if arguments.method is not None:
         if arguments.policy != "acfra":
@@ -261,6 +264,16 @@ def _policy(arguments: argparse.Namespace, skill: Skill, arm: ArmModel, spheres:
             raise InputError(f"--alternative is an option of --policy acfra, not of {arguments.policy}; leave it out")
         options["alternatives"] = [Skill.load(file) for file in arguments.alternative]
     return POLICIES[arguments.policy].build(skill, **options)
+
+
+def _check_numbers(arguments: argparse.Namespace) -> None:
+    """Reject lengths and positions that can't be used, with the name and the unit of their options."""
+    finite_number(arguments.clearance, "--clearance", "mm", at_least=0.0)
+    if arguments.tool_radius is not None:
+        finite_number(arguments.tool_radius, "--tool-radius", "mm", at_least=0.0)
+    for option, position in (("--start", arguments.start), ("--goal", arguments.goal)):
+        if position is not None:
+            finite_vector(position, 3, option, "cm")
 
 
 def _start(skill: Skill, arm: ArmModel, centimetres: Sequence[float] | None) -> Pose:

@@ -114,6 +114,11 @@ class Policy(ABC):
                 f"constructor take the arguments of Policy's constructor"
             ) from error
 
+    @classmethod
+    def takes(cls, option: str) -> bool:
+        """Return whether the constructor takes the option of this name."""
+        return option in _parameters(cls)
+
     @abstractmethod
     def reset(self, observation: Observation) -> None:
         """Start a reproduction in the observed scene.
