@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from functools import lru_cache
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,10 +15,10 @@ from scipy.ndimage import gaussian_filter1d
 from imitarm.benchmark.moving_motions import BEFORE
 from imitarm.benchmark.real_motions import real_motions
 from imitarm.errors import InputError
-from imitarm.kinematics.pose import quaternion_exp, quaternion_multiply, rotate
+from imitarm.kinematics.pose import quaternion_exp, rotate
+from imitarm.perception.person_motion import moving_capsule
 from imitarm.scene import Capsule
 from imitarm.scene.motion import Track
-from imitarm.scene.obstacle import rotation_from_z
 
 Array = NDArray[np.float64]
 
@@ -95,29 +94,6 @@ def person_arm(
     keep = (times >= -BEFORE) & (times <= until)
     parts = []
     for name, first, radius in (("upper arm", 0, _UPPER), ("forearm", 1, _FORE)):
-        parts.append(_capsule(placed[keep, first], placed[keep, first + 1], radius, name, times[keep]))
+        parts.append(moving_capsule(placed[keep, first], placed[keep, first + 1], radius, name, times[keep]))
     (upper, upper_track), (fore, fore_track) = parts
     return (upper, fore), (upper_track, fore_track)
-
-
-def _capsule(starts: Array, ends: Array, radius: float, name: str, times: Array) -> tuple[Capsule, Track]:
-    """Return a capsule of the mean length, and its motion: the middle, and the direction of the axis."""
-    axis = ends - starts
-    length = np.linalg.norm(axis, axis=1)
-    middle, unit = 0.5 * (starts + ends), axis / length[:, None]
-    half = 0.5 * float(length.mean()) * unit[0]
-    capsule = Capsule(middle[0] - half, middle[0] + half, radius, name=name)
-    return capsule, Track(times, middle, _rotations(unit))
-
-
-def _rotations(units: Array) -> Array:
-    """Return rotations that take z to each direction, each the smallest rotation from the one before, shape (n, 4)."""
-    found = [rotation_from_z(units[0])]
-    for before, now in pairwise(units):
-        across = np.cross(before, now)
-        sine = float(np.linalg.norm(across))
-        angle = math.atan2(sine, float(before @ now))
-        step = quaternion_exp(angle * across / sine) if sine > 1e-12 else np.array([1.0, 0.0, 0.0, 0.0])
-        turned = quaternion_multiply(step, found[-1])
-        found.append(turned / np.linalg.norm(turned))
-    return np.array(found)

@@ -1,0 +1,109 @@
+"""ReachingPerson: a person beside the table reaches across the path of the brush, and a skeleton camera sees it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from imitarm.capture.camera_model import SkeletonCamera
+from imitarm.capture.person import Person
+from imitarm.capture.skeleton import Skeleton
+from imitarm.capture.synthetic import SyntheticSource
+from imitarm.control_loop.person_observer import PersonObserver
+from imitarm.kinematics.pose import Pose
+from imitarm.perception import PersonCapsules
+from imitarm.perception.person_capsules import upright_camera
+from imitarm.perception.person_motion import moving_arms
+from imitarm.scene import MovingScene
+
+Array = NDArray[np.float64]
+
+LEAD = 1.0
+"""Time for which the camera sees the person before the arm moves [s]."""
+DEVIATIONS = 2.0
+"""Standard deviations of a capsule's position that the safety filter adds to the clearance."""
+_DURATION = 45.0  # [s] as long as a sweep may take
+_MOVES = 14.0  # [s] after this time, the person rests
+_PERSON, _STANDS = 6, (1.2, -0.24)  # seed of the person; x and y of the person's feet [m]
+_CAMERA = (-1.0, -1.0, 0.35)  # [m] behind the arm and beside it, at the height that the skeletons of a Person assume
+_SIGMA = 0.012  # [m] error of the camera
+_STEP = 0.02  # [s] between two samples of the true motion
+
+# time [s], place of the right wrist x, y, z [m], distance by which the person leans forward [m]
+_REACHES = np.array(
+    [
+        [0.0, 1.00, 0.06, 0.25, 0.00],
+        [1.4, 1.00, 0.06, 0.25, 0.00],
+        [3.2, 0.70, -0.20, 0.16, 0.20],
+        [4.4, 0.70, -0.20, 0.16, 0.20],
+        [6.0, 1.00, 0.06, 0.25, 0.00],
+        [7.2, 1.00, 0.06, 0.25, 0.00],
+        [8.8, 0.82, 0.22, 0.18, 0.12],
+        [10.2, 0.82, 0.22, 0.18, 0.12],
+        [11.8, 1.00, 0.06, 0.25, 0.00],
+    ]
+)
+
+
+class ReachingPerson:
+    """A simulated person who reaches across the path of the brush twice with the right hand.
+
+    The person stands at the far side of the table and faces the arm. The first reach crosses the path before the dirt,
+    the second reach behind the dirt. Between two places, the hand moves on a straight line with the least jerk. The
+    body leans forward by shifting. The sizes of the limbs, tremor and sway are those of
+    :class:`~imitarm.capture.person.Person`.
+
+    A simulated skeleton camera sees the person at 30 Hz with errors of about 1.2 cm, dropouts and occlusions.
+    """
+
+    camera: Pose = upright_camera(_CAMERA)
+    """Pose ``sensor_to_base`` of the skeleton camera."""
+
+    @classmethod
+    def truth(cls, time: float) -> Skeleton:
+        """Return the true skeleton in the frame of the camera; the arm begins to move at the time 0 [s]."""
+        place = _eased(min(time, _MOVES))
+        to_sensor = cls.camera.inverse()
+        feet = to_sensor.apply([_STANDS[0] - place[3], _STANDS[1], 0.0])
+        person = replace(Person.from_seed(_PERSON), position=feet[[0, 2]])
+        return person.skeleton(time, to_sensor.apply(place[:3]))
+
+    @classmethod
+    def scene(cls) -> MovingScene:
+        """Return the true arms of the person as moving capsules, without fixtures."""
+        times = np.arange(-LEAD, _DURATION, _STEP)
+        moving = _moving(tuple(times.tolist()))
+        return MovingScene(moving.at(0.0), moving.motions)
+
+    @classmethod
+    def observer(cls, seed: int = 0) -> PersonObserver:
+        """Return the function ``observe`` of a control loop: camera, capsules and tracker.
+
+        Args:
+            seed: seed of the camera's errors.
+        """
+        source = SyntheticSource(
+            lambda time: replace(cls.truth(time - LEAD), time=time),
+            SkeletonCamera(seed, sigma=_SIGMA),
+            _DURATION + LEAD,
+            name="reaching person",
+        )
+        return PersonObserver(source, PersonCapsules(cls.camera), start=-LEAD)
+
+
+@lru_cache(maxsize=1)
+def _moving(times: tuple[float, ...]) -> MovingScene:
+    capsules = PersonCapsules(ReachingPerson.camera)
+    return moving_arms([ReachingPerson.truth(time) for time in times], capsules)
+
+
+def _eased(time: float) -> Array:
+    """Return the place of the wrist and the lean at a time, on minimum-jerk lines between the rows of ``_REACHES``."""
+    times, places = _REACHES[:, 0], _REACHES[:, 1:]
+    k = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, len(times) - 2))
+    u = float(np.clip((time - times[k]) / (times[k + 1] - times[k]), 0.0, 1.0))
+    share = u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
+    return np.asarray(places[k] + share * (places[k + 1] - places[k]))
