@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,9 +19,12 @@ from imitarm.errors import InputError
 from imitarm.files.document import write_text
 from imitarm.perception import ObstacleTracker
 from imitarm.policies import ACFRA, ADAPTERS, HORIZONTAL_ONLY, Policy
+from imitarm.robots import SimulatedRobot
+from imitarm.scene import Scene
 from imitarm.skills import Skill
+from imitarm.tasks import reaching_person
 from imitarm.tasks.pushed_cube import LINKS, sweeping_rcamo
-from imitarm.tasks.sweep import DEMONSTRATIONS, MOVING_SCENES, NUMBERED_SCENES, SCENES, SweepTask
+from imitarm.tasks.sweep import DEMONSTRATIONS, MOVING_SCENES, NUMBERED_SCENES, PERSON_REACHES, SCENES, SweepTask
 from imitarm.trajectory import Demonstration
 from imitarm.viewer import Report, SceneResult, as_data, write_report
 
@@ -33,10 +37,12 @@ examples:
 
 The package contains eight demonstrations: a synthetic teacher guides the simulated Sawyer by hand to sweep a table.
 The command checks and aligns the demonstrations, and learns a skill from them.
-The command then reproduces the skill in seven scenes.
-One scene has no obstacles, four have standing obstacles, and two have moving obstacles.
+The command then reproduces the skill in eight scenes.
+One scene has no obstacles, four have standing obstacles, and in two, obstacles move.
+In the last scene, a person reaches across the path of the brush.
 With --scenes, the command uses the scenes that you name instead.
 A simulated sensor and a tracker observe the moving obstacles (noise 5 mm, 30 frames per second, 33 ms delay).
+A simulated skeleton camera and a tracker observe the person (error 12 mm, 30 frames per second, 33 ms delay).
 T1 to T8 are eight scenes with two to four obstacles, modelled on the eight tasks of the thesis (Table 4.1).
 The command writes skill.json, report.html (opens offline in any browser) and results.json to FOLDER.
 The command replaces existing files only with --force.
@@ -53,13 +59,17 @@ _SUMMARY = (
     "moved, and only as far as needed for the required clearance. A synthetic teacher gave the "
     "demonstrations by guiding the simulated arm by hand. Clearance, torques and the number of swept crumbs are "
     "measured in the simulator, not taken from the plan. In the scenes with moving obstacles, a tracker estimates "
-    "their positions and velocities from noisy, late measurements, and the policy RCAMO evades them step by step."
+    "their positions and velocities from noisy, late measurements, and the policy RCAMO evades them step by step. "
+    "In the last scene, a person reaches across the path. The tracker estimates the motion of the person's arms from "
+    "the skeletons of a camera, such as a camera that records demonstrations."
 )
 
 _CAPTIONS = {
     "pushed_box": "A box is pushed into the path of the brush, out of it, and into it again behind the crumbs.",
     "pushed_box_and_bottle": "A bottle and a box are pushed into the path of the brush, one from each side; a low box "
     "stands beside the path.",
+    PERSON_REACHES: "A person reaches across the path of the brush twice, before the crumbs and behind them. Each arm "
+    "of the person is two capsules: the upper arm, and the forearm with the hand.",
     "free": "No obstacle is in the way: the brush follows the learned path.",
     "two_boxes": "Two boxes stand on the learned path, one in front of the crumbs and one behind them.",
     "tall_and_low": "A tall and a low box stand on opposite sides of the learned path.",
@@ -153,14 +163,12 @@ def _sweep(
     progress.update(whole, description=f"sweeping: {name}")
     before = progress.tasks[0].completed
     policy: Policy
+    observe: Callable[[float], Scene] | None = None
+    links: float | None = None
     if name in MOVING_SCENES:
-        moving = task.moving_scene(name)
-        robot = task.robot(moving)
-        policy = sweeping_rcamo(skill, task, max_acceleration=_MAX_ACCELERATION)
-        observe: TrackedScene | None = TrackedScene(moving, SensorModel(seed=task.seed), ObstacleTracker())
+        robot, policy, observe, links = _among_moving(task, name, skill)
     else:
         robot = task.robot(task.scene(name))
-        observe = None
         policy = ACFRA(
             skill,
             method=method,
@@ -180,12 +188,30 @@ def _sweep(
         demonstrations=demonstrations,
         evaluate=task.evaluate,
         observe=observe,
-        link_clearance=LINKS if observe is not None else None,
+        link_clearance=links,
         caption=_CAPTIONS.get(name, ""),
         progress=lambda fraction: progress.update(whole, completed=before + fraction),
     )
     progress.update(whole, completed=before + 1.0)
     return result
+
+
+def _among_moving(
+    task: SweepTask, name: str, skill: Skill
+) -> tuple[SimulatedRobot, Policy, Callable[[float], Scene], float]:
+    """Return the robot in a scene with moving obstacles, the policy, the observer, and the clearance of the links [m].
+
+    A skeleton camera observes a person; a simulated sensor observes all other obstacles.
+    """
+    moving = task.moving_scene(name)
+    robot = task.robot(moving)
+    if name == PERSON_REACHES:
+        policy = sweeping_rcamo(
+            skill, task, max_acceleration=reaching_person.MAX_ACCELERATION, tool_spheres=reaching_person.BRUSH_AND_WRIST
+        )
+        return robot, policy, reaching_person.ReachingPerson.observer(task.seed), reaching_person.LINKS
+    policy = sweeping_rcamo(skill, task, max_acceleration=_MAX_ACCELERATION)
+    return robot, policy, TrackedScene(moving, SensorModel(seed=task.seed), ObstacleTracker()), LINKS
 
 
 def _write_json(data: object, path: Path) -> None:

@@ -7,7 +7,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from imitarm.control_loop.camera_observer import CameraObserver
 from imitarm.control_loop.observer import SensorModel, TrackedScene
@@ -108,7 +108,9 @@ def learned_sweep() -> Skill:
     return Skill().fit(align(read(DEMONSTRATIONS)))
 
 
-def sweeping_rcamo(skill: Skill, task: SweepTask, *, max_acceleration: float) -> RCAMO:
+def sweeping_rcamo(
+    skill: Skill, task: SweepTask, *, max_acceleration: float, tool_spheres: ArrayLike | None = None
+) -> RCAMO:
     """Return the policy RCAMO for the sweep.
 
     The brush stays on the table and avoids obstacles only to the left or right.
@@ -118,10 +120,12 @@ def sweeping_rcamo(skill: Skill, task: SweepTask, *, max_acceleration: float) ->
         task: the task, with the radius of the brush and the required clearance.
         max_acceleration: largest acceleration of the brush away from the learned path [m/s^2]. If the joints of the arm
             can't follow this acceleration, the brush tilts and touches the table.
+        tool_spheres: spheres that keep the clearance, rows x, y, z, radius in the tool's frame [m]; None: one sphere
+            around the brush.
     """
     return RCAMO(
         skill,
-        tool_spheres=[[0.0, 0.0, 0.0, task.tool_radius]],
+        tool_spheres=[[0.0, 0.0, 0.0, task.tool_radius]] if tool_spheres is None else tool_spheres,
         clearance=task.clearance,
         forbidden=HORIZONTAL_ONLY,
         time_constant=_TIME_CONSTANT,

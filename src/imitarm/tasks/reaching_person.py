@@ -23,10 +23,22 @@ Array = NDArray[np.float64]
 
 LEAD = 1.0
 """Time for which the camera sees the person before the arm moves [s]."""
-DEVIATIONS = 2.0
-"""Standard deviations of a capsule's position that the safety filter adds to the clearance."""
-_DURATION = 45.0  # [s] as long as a sweep may take
-_MOVES = 14.0  # [s] after this time, the person rests
+LINKS = 0.03
+"""Clearance that the safety filter keeps between the arm and the tracked capsules [m]; the camera's error is 1.2 cm."""
+MAX_ACCELERATION = 4.0
+"""Largest acceleration of the brush away from the learned path [m/s^2].
+
+With a larger value, the brush follows the noise of the skeletons, tilts, and touches the table.
+"""
+BRUSH_AND_WRIST = np.array(
+    [[0.0, 0.0, 0.0, 0.058], [0.0, 0.0, -0.12, 0.05], [0.0, 0.0, -0.23, 0.06], [0.0, 0.0, -0.31, 0.06]]
+)
+"""Spheres of the brush, its handle and the wrist of a Sawyer in the tool's frame, rows x, y, z, radius [m].
+
+A person's forearm crosses the path above the table, so the policy must also keep the handle and the wrist clear.
+"""
+_DURATION = 50.0  # [s] longer than a sweep may take
+_MOVES = 12.5  # [s] after this time, the person rests
 _PERSON, _STANDS = 6, (1.2, -0.24)  # seed of the person; x and y of the person's feet [m]
 _CAMERA = (-1.0, -1.0, 0.35)  # [m] behind the arm and beside it, at the height that the skeletons of a Person assume
 _SIGMA = 0.012  # [m] error of the camera
@@ -35,15 +47,15 @@ _STEP = 0.02  # [s] between two samples of the true motion
 # time [s], place of the right wrist x, y, z [m], distance by which the person leans forward [m]
 _REACHES = np.array(
     [
-        [0.0, 1.00, 0.06, 0.25, 0.00],
-        [1.4, 1.00, 0.06, 0.25, 0.00],
-        [3.2, 0.70, -0.20, 0.16, 0.20],
-        [4.4, 0.70, -0.20, 0.16, 0.20],
-        [6.0, 1.00, 0.06, 0.25, 0.00],
-        [7.2, 1.00, 0.06, 0.25, 0.00],
-        [8.8, 0.82, 0.22, 0.18, 0.12],
-        [10.2, 0.82, 0.22, 0.18, 0.12],
-        [11.8, 1.00, 0.06, 0.25, 0.00],
+        [0.0, 1.00, 0.00, 0.25, 0.00],
+        [0.8, 1.00, 0.00, 0.25, 0.00],
+        [3.0, 0.70, -0.18, 0.16, 0.20],
+        [4.4, 0.70, -0.18, 0.16, 0.20],
+        [6.4, 1.00, 0.06, 0.25, 0.00],
+        [6.6, 1.00, 0.06, 0.25, 0.00],
+        [8.6, 0.84, 0.22, 0.18, 0.12],
+        [10.2, 0.84, 0.22, 0.18, 0.12],
+        [12.0, 1.00, 0.06, 0.25, 0.00],
     ]
 )
 
@@ -65,17 +77,17 @@ class ReachingPerson:
     @classmethod
     def truth(cls, time: float) -> Skeleton:
         """Return the true skeleton in the frame of the camera; the arm begins to move at the time 0 [s]."""
-        place = _eased(min(time, _MOVES))
+        moved = min(time, _MOVES)
+        place = _eased(moved)
         to_sensor = cls.camera.inverse()
         feet = to_sensor.apply([_STANDS[0] - place[3], _STANDS[1], 0.0])
         person = replace(Person.from_seed(_PERSON), position=feet[[0, 2]])
-        return person.skeleton(time, to_sensor.apply(place[:3]))
+        return replace(person.skeleton(moved, to_sensor.apply(place[:3])), time=time)
 
     @classmethod
     def scene(cls) -> MovingScene:
         """Return the true arms of the person as moving capsules, without fixtures."""
-        times = np.arange(-LEAD, _DURATION, _STEP)
-        moving = _moving(tuple(times.tolist()))
+        moving = _arms()
         return MovingScene(moving.at(0.0), moving.motions)
 
     @classmethod
@@ -95,9 +107,9 @@ class ReachingPerson:
 
 
 @lru_cache(maxsize=1)
-def _moving(times: tuple[float, ...]) -> MovingScene:
-    capsules = PersonCapsules(ReachingPerson.camera)
-    return moving_arms([ReachingPerson.truth(time) for time in times], capsules)
+def _arms() -> MovingScene:
+    times = np.arange(-LEAD, _MOVES + 0.5 * _STEP, _STEP)
+    return moving_arms([ReachingPerson.truth(time) for time in times.tolist()], PersonCapsules(ReachingPerson.camera))
 
 
 def _eased(time: float) -> Array:

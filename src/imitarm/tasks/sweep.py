@@ -19,6 +19,7 @@ from imitarm.robots.simulated import Control, SimulatedRobot
 from imitarm.robots.world import arm_world
 from imitarm.scene import Box, HalfSpace, MovingScene, Scene, load_moving_scene, load_scene, standard_fixtures
 from imitarm.tasks.habits import Motion, along
+from imitarm.tasks.reaching_person import ReachingPerson
 from imitarm.trajectory import Rollout, Trajectory
 
 Array = NDArray[np.float64]
@@ -30,7 +31,9 @@ SCENES = (
     *("boxes_and_cone", "cone_first", "three_boxes"),
     *("two_boxes_two_cones", "three_boxes_and_cone"),
 )
-MOVING_SCENES = ("pushed_box", "pushed_box_and_bottle")  # obstacles that move while the arm sweeps
+PERSON_REACHES = "person_reaches"
+"""Name of the scene in which a person reaches across the path of the brush."""
+MOVING_SCENES = ("pushed_box", "pushed_box_and_bottle", PERSON_REACHES)  # obstacles that move while the arm sweeps
 NUMBERED_SCENES = {f"T{i}": name for i, name in enumerate(SCENES) if i}  # eight tasks, as in thesis Table 4.1
 
 TABLE_CENTER, TABLE_SIZE = (0.66, 0.0), (0.72, 1.36, 0.04)  # [m] its top is at height 0
@@ -120,7 +123,10 @@ class SweepTask:
         """
         if name not in MOVING_SCENES:
             raise UnknownNameError.among("moving scene", name, MOVING_SCENES)
-        moving = load_moving_scene(DEMONSTRATIONS / "scenes" / f"{name}.yaml")
+        if name == PERSON_REACHES:
+            moving = ReachingPerson.scene()
+        else:
+            moving = load_moving_scene(DEMONSTRATIONS / "scenes" / f"{name}.yaml")
         table = HalfSpace(np.zeros(3), name="table")
         return replace(moving, scene=replace(moving.scene, fixtures=(table, *standard_fixtures())))
 
