@@ -60,7 +60,7 @@ _SUMMARY = (
     "demonstrations by guiding the simulated arm by hand. Clearance, torques and the number of swept crumbs are "
     "measured in the simulator, not taken from the plan. In the scenes with moving obstacles, a tracker estimates "
     "their positions and velocities from noisy, late measurements, and the policy RCAMO evades them step by step. "
-    "In the last scene, a person reaches across the path. The tracker estimates the motion of the person's arms from "
+    "In the last scene, a person reaches across the path. The tracker estimates the motion of the person's arm from "
     "the skeletons of a camera, such as a camera that records demonstrations."
 )
 
@@ -68,8 +68,8 @@ _CAPTIONS = {
     "pushed_box": "A box is pushed into the path of the brush, out of it, and into it again behind the crumbs.",
     "pushed_box_and_bottle": "A bottle and a box are pushed into the path of the brush, one from each side; a low box "
     "stands beside the path.",
-    PERSON_REACHES: "A person reaches across the path of the brush twice, before the crumbs and behind them. Each arm "
-    "of the person is two capsules: the upper arm, and the forearm with the hand.",
+    PERSON_REACHES: "A person reaches across the path of the brush before the crumbs, and close to the path behind them. "
+    "The arm is modelled as two capsules: the upper arm, and the forearm with the hand.",
     "free": "No obstacle is in the way: the brush follows the learned path.",
     "two_boxes": "Two boxes stand on the learned path, one in front of the crumbs and one behind them.",
     "tall_and_low": "A tall and a low box stand on opposite sides of the learned path.",

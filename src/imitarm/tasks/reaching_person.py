@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,8 @@ Array = NDArray[np.float64]
 
 LEAD = 1.0
 """Time for which the camera sees the person before the arm moves [s]."""
+SIDE = "right"
+"""Side of the arm that reaches. The other arm hangs down behind the table, and is not in the scene."""
 LINKS = 0.03
 """Clearance that the safety filter keeps between the arm and the tracked capsules [m]; the camera's error is 1.2 cm."""
 MAX_ACCELERATION = 4.0
@@ -47,32 +50,34 @@ _STEP = 0.02  # [s] between two samples of the true motion
 # time [s], place of the right wrist x, y, z [m], distance by which the person leans forward [m]
 _REACHES = np.array(
     [
-        [0.0, 1.00, 0.00, 0.25, 0.00],
-        [0.8, 1.00, 0.00, 0.25, 0.00],
-        [3.0, 0.70, -0.18, 0.16, 0.20],
-        [4.4, 0.70, -0.18, 0.16, 0.20],
-        [6.4, 1.00, 0.06, 0.25, 0.00],
-        [6.6, 1.00, 0.06, 0.25, 0.00],
-        [8.6, 0.84, 0.22, 0.18, 0.12],
-        [10.2, 0.84, 0.22, 0.18, 0.12],
-        [12.0, 1.00, 0.06, 0.25, 0.00],
+        [0.0, 1.00, 0.00, 0.31, 0.00],
+        [0.8, 1.00, 0.00, 0.31, 0.00],
+        [3.0, 0.70, -0.18, 0.19, 0.20],
+        [4.4, 0.70, -0.18, 0.19, 0.20],
+        [6.4, 1.00, 0.06, 0.31, 0.00],
+        [6.6, 1.00, 0.06, 0.31, 0.00],
+        [8.6, 0.84, 0.22, 0.22, 0.12],
+        [10.2, 0.84, 0.22, 0.22, 0.12],
+        [12.0, 1.00, 0.06, 0.31, 0.00],
     ]
 )
 
 
 class ReachingPerson:
-    """A simulated person who reaches across the path of the brush twice with the right hand.
+    """A simulated person who reaches over the table twice with the right hand while the arm sweeps.
 
-    The person stands at the far side of the table and faces the arm. The first reach crosses the path before the dirt,
-    the second reach behind the dirt. Between two places, the hand moves on a straight line with the least jerk. The
+    The person stands at the far side of the table and faces the arm. The first reach crosses the path of the brush
+    before the dirt. The second reach ends beside the path behind the dirt, too near for the brush to pass. Between two places, the hand moves on a straight line with the least jerk. The
     body leans forward by shifting. The sizes of the limbs, tremor and sway are those of
     :class:`~imitarm.capture.person.Person`.
 
     A simulated skeleton camera sees the person at 30 Hz with errors of about 1.2 cm, dropouts and occlusions.
     """
 
-    camera: Pose = upright_camera(_CAMERA)
+    camera: ClassVar[Pose] = upright_camera(_CAMERA)
     """Pose ``sensor_to_base`` of the skeleton camera."""
+    capsules: ClassVar[PersonCapsules] = PersonCapsules(camera, sides=[SIDE])
+    """The object that converts skeletons to capsules."""
 
     @classmethod
     def truth(cls, time: float) -> Skeleton:
@@ -86,8 +91,8 @@ class ReachingPerson:
 
     @classmethod
     def scene(cls) -> MovingScene:
-        """Return the true arms of the person as moving capsules, without fixtures."""
-        moving = _arms()
+        """Return the true arm of the person as two moving capsules, without fixtures."""
+        moving = _arm()
         return MovingScene(moving.at(0.0), moving.motions)
 
     @classmethod
@@ -103,13 +108,14 @@ class ReachingPerson:
             _DURATION + LEAD,
             name="reaching person",
         )
-        return PersonObserver(source, PersonCapsules(cls.camera), start=-LEAD)
+        skeletons = (replace(skeleton, time=skeleton.time - LEAD) for skeleton in source)
+        return PersonObserver(skeletons, cls.capsules, start=None)
 
 
 @lru_cache(maxsize=1)
-def _arms() -> MovingScene:
+def _arm() -> MovingScene:
     times = np.arange(-LEAD, _MOVES + 0.5 * _STEP, _STEP)
-    return moving_arms([ReachingPerson.truth(time) for time in times.tolist()], PersonCapsules(ReachingPerson.camera))
+    return moving_arms([ReachingPerson.truth(time) for time in times.tolist()], ReachingPerson.capsules)
 
 
 def _eased(time: float) -> Array:

@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 
 AHEAD = 0.3
 """Time from an observation to the instant for which the playback shows the obstacle's predicted position [s]."""
+_NO_ROTATION = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,13 +30,16 @@ class Prediction:
         positions: predicted positions of the obstacle's local frame, shape (n_frames, 3) [m]; nan in frames without the
             obstacle.
         covariances: covariances of these positions, shape (n_frames, 3, 3) [m^2].
-        extent: half extents of the obstacle along the axes of the base frame, shape (3,) [m].
+        extent: half extents of the obstacle along the axes of its local frame, shape (3,) [m].
+        quaternions: predicted rotations wxyz of the local frame, shape (n_frames, 4); None: the obstacle does not
+            rotate.
     """
 
     name: str
     positions: Array
     covariances: Array
     extent: Array
+    quaternions: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,14 +144,19 @@ def _predictions(seen: list[Scene | None]) -> tuple[Prediction, ...]:
     for frame, scene in enumerate(seen):
         if scene is None:
             continue
-        ahead, _ = scene.poses(scene.stamp + AHEAD)
+        ahead, rotations = scene.poses(scene.stamp + AHEAD)
         for i, number in enumerate(scene.packed.track_ids.tolist()):
             if number < 0:
                 continue
             if number not in found:
-                extent = 0.5 * np.ptp(scene.obstacles[i].bounds(), axis=0)
+                upright = scene.obstacles[i].placed(np.zeros(3), _NO_ROTATION, np.zeros(3), np.zeros(3))
+                extent = 0.5 * np.ptp(upright.bounds(), axis=0)
                 positions, covariances = np.full((len(seen), 3), np.nan), np.zeros((len(seen), 3, 3))
-                found[number] = Prediction(scene.name_of(i), positions, covariances, extent)
+                quaternions = np.tile(_NO_ROTATION, (len(seen), 1))
+                found[number] = Prediction(scene.name_of(i), positions, covariances, extent, quaternions)
             found[number].positions[frame] = ahead[i]
+            turned = found[number].quaternions
+            assert turned is not None
+            turned[frame] = rotations[i]
             found[number].covariances[frame] = scene.packed.covariances[i]
     return tuple(found.values())

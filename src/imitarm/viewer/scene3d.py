@@ -18,7 +18,7 @@ import rich
 from numpy.typing import NDArray
 
 from imitarm.errors import InputError, TaskFailedError
-from imitarm.kinematics.pose import matrix_to_quaternion
+from imitarm.kinematics.pose import matrix_to_quaternion, quaternion_to_matrix
 from imitarm.viewer import palette
 from imitarm.viewer.person import PersonMark, draw_person
 from imitarm.viewer.recording import Prediction, Recording
@@ -178,12 +178,16 @@ def _draw_components(server: Any, components: Sequence[ComponentMark]) -> None:
 def _draw_predictions(server: Any, predictions: Sequence[Prediction]) -> list[Mover]:
     """Draw each predicted obstacle as an ellipsoid; return the nodes that must move.
 
-    The semi-axes are the half extents of the obstacle plus its 95 % uncertainty along the axes of the world frame.
+    The semi-axes are the half extents of the obstacle plus its 95 % uncertainty along the axes of its local frame.
     """
     movers = []
     for number, prediction in enumerate(predictions):
         seen = np.asarray(np.isfinite(prediction.positions).all(axis=1))
-        deviations = np.sqrt(np.maximum(np.diagonal(prediction.covariances, axis1=1, axis2=2), 0.0))
+        turns = prediction.quaternions
+        turns = np.tile([1.0, 0.0, 0.0, 0.0], (len(seen), 1)) if turns is None else turns
+        axes = quaternion_to_matrix(turns)  # the axes of the local frame, shape (n_frames, 3, 3)
+        variances = np.einsum("nji,njk,nki->ni", axes, prediction.covariances, axes)
+        deviations = np.sqrt(np.maximum(variances, 0.0))
         scale = np.round((prediction.extent + np.sqrt(_CHI2_95) * deviations) / STEP) * STEP
         positions = np.round(np.nan_to_num(prediction.positions) / STEP) * STEP
         handle = server.scene.add_icosphere(
@@ -193,11 +197,12 @@ def _draw_predictions(server: Any, predictions: Sequence[Prediction]) -> list[Mo
             opacity=0.45,
             scale=tuple(scale[0].tolist()),
             position=positions[0],
+            wxyz=turns[0],
             visible=bool(seen[0]),
             cast_shadow=False,
             receive_shadow=False,
         )
-        movers.append(Mover(handle, {"position": positions, "scale": scale, "visible": seen}))
+        movers.append(Mover(handle, {"position": positions, "wxyz": turns, "scale": scale, "visible": seen}))
     return movers
 
 
