@@ -67,9 +67,10 @@ class ReachingPerson:
     """A simulated person who reaches over the table twice with the right hand while the arm sweeps.
 
     The person stands at the far side of the table and faces the arm. The first reach crosses the path of the brush
-    before the dirt. The second reach ends beside the path behind the dirt, too near for the brush to pass. Between two places, the hand moves on a straight line with the least jerk. The
-    body leans forward by shifting. The sizes of the limbs, tremor and sway are those of
-    :class:`~imitarm.capture.person.Person`.
+    before the dirt. The second reach ends beside the path behind the dirt, too near for the brush to pass without a
+    displacement. Between two places, the hand moves on a straight line with the least jerk. If a place is out of reach,
+    the arm stretches towards it. The body leans forward by shifting. The sizes of the limbs, tremor and sway are those
+    of :class:`~imitarm.capture.person.Person`.
 
     A simulated skeleton camera sees the person at 30 Hz with errors of about 1.2 cm, dropouts and occlusions.
     """
