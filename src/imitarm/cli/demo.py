@@ -76,8 +76,8 @@ _CAPTIONS = {
     "pushed_box_and_bottle": "A bottle and a box are pushed into the path of the brush, one from each side; a low box "
     "stands beside the path.",
     PERSON_REACHES: "A person reaches across the path of the brush before the crumbs, and close to the path behind "
-    "them. The arm is modelled as two capsules: the upper arm, and the forearm with the hand. A tracker estimates their "
-    "motion from the skeletons of a simulated camera.",
+    "them. The arm is modelled as two capsules: the upper arm, and the forearm with the hand. A tracker estimates "
+    "their motion from the skeletons of a simulated camera.",
     "free": "No obstacle is in the way: the brush follows the learned path.",
     "two_boxes": "Two boxes stand on the learned path, one in front of the crumbs and one behind them.",
     "tall_and_low": "A tall and a low box stand on opposite sides of the learned path.",
