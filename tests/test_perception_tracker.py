@@ -108,6 +108,50 @@ def test_the_speed_is_capped():
     assert 0.49 < np.linalg.norm(track.velocity) <= 0.5 + 1e-12
 
 
+SUDDEN = {"stops": (0.6, 0.0), "starts": (0.0, 0.6), "turns back": (0.4, -0.4), "turns aside": (0.4, 0.4j)}
+"""Speeds before and after the change, as complex numbers: real along x, imaginary along y [m/s]."""
+
+
+@each_motion
+@pytest.mark.parametrize("change", SUDDEN)
+def test_a_track_continues_after_a_sudden_change(motion, change):
+    before, after = SUDDEN[change]
+    times = np.arange(90) / 30.0
+    place = np.where(times < 1.5, before * times, before * 1.5 + after * (times - 1.5))
+    truth = np.column_stack([place.real, place.imag, np.zeros(90)])
+    for seed in range(20):
+        noise = np.random.default_rng(seed).normal(0.0, SIGMA, truth.shape)
+        tracker = ObstacleTracker(motion)
+        for time, position in zip(times, truth + noise, strict=True):
+            tracks = tracker.update(time, [sphere(position)])
+            assert len(tracks) <= 1, f"at {time:.2f} s, a second track follows the same obstacle"
+        assert tracks[0].track_id == 0
+        velocity = np.array([complex(after).real, complex(after).imag, 0.0])
+        assert np.linalg.norm(tracks[0].velocity - velocity) < (0.45 if motion == "constant-acceleration" else 0.25)
+        assert np.linalg.norm(tracks[0].position - truth[-1]) < 4.0 * SIGMA
+
+
+@each_motion
+def test_a_new_obstacle_far_from_a_lost_one_gets_a_track_of_its_own(motion):
+    tracker = ObstacleTracker(motion)
+    times = np.arange(30) / 30.0
+    run(tracker, times[:, None] * [0.3, 0.0, 0.0], times)
+    elsewhere = np.array([0.3, 0.25, 0.0])
+    for time in 1.0 + np.arange(3) / 30.0:
+        tracks = tracker.update(time, [sphere(elsewhere)])
+    assert [track.track_id for track in tracks] == [0, 1]
+
+
+@each_motion
+def test_a_label_is_never_continued_by_another(motion):
+    tracker = ObstacleTracker(motion)
+    for time in np.arange(30) / 30.0:
+        tracker.update(time, [sphere([0.6 * time, 0.0, 0.0], "bottle")])
+    for time in 1.0 + np.arange(3) / 30.0:
+        tracks = tracker.update(time, [sphere([0.58, 0.03, 0.0], "cube")])
+    assert [track.label for track in tracks] == ["bottle", "cube"]
+
+
 @settings(deadline=None, max_examples=20)
 @given(seed=seeds)
 def test_a_standing_obstacle_is_exact(seed):

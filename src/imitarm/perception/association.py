@@ -21,6 +21,7 @@ _FORBIDDEN = 1e9  # cost of a pair outside the gate: worse than any number of pa
 _ONES = np.ones(3)
 _OTHER_KIND, _MOST = 4.0, 9.0  # see unlikeness
 _SIZE, _ANGLE = 0.02, 0.4  # [m], [rad]
+_LONGEST_GAP = 0.25  # [s] since the last detection, after which a track has no successor
 _NONE = np.empty(0, dtype=np.intp)
 
 
@@ -86,6 +87,47 @@ def assigned(tracks: Tracks, detections: Sequence[Detection], measured: Measurem
         free[found.detections] = False
         pairs = pairs.joined(found)
     return pairs.in_order()
+
+
+def successors(tracks: Tracks, new: NDArray[np.bool_], gate: float, spare: float) -> Pairs:
+    r"""Find new tracks that follow the obstacles of older tracks, after sudden changes of their velocities.
+
+    An obstacle that suddenly stops, starts or turns back leaves the gate of its track, and its detections begin a new
+    track. Two tracks may belong to the same obstacle if no update contained detections of both, and if
+
+    .. math:: |z - p| \le \sqrt{\gamma\,\mathrm{tr}\,S} + (|v| + v_0)\,\tau
+
+    Here, ``z`` is the position of the new track, ``p`` and ``v`` are the predicted position and velocity of the
+    confirmed track, ``S`` is the covariance of ``z - p``, ``gamma`` is the gate, and ``tau`` is the time since the last
+    detection of the confirmed track, at most 0.25 s. Each track is used at most once, and the sum of the distances is
+    the smallest possible.
+
+    Args:
+        tracks: the tracks at the time of an update.
+        new: whether each track is about to be confirmed, shape (n,).
+        gate: ``gamma``, the largest normalised innovation squared of a pair inside the gate.
+        spare: ``v_0``, change of the velocity of an obstacle at rest [m/s].
+
+    Returns:
+        The pairs; ``tracks`` are the older tracks, ``detections`` are the new tracks, and ``distances`` are [m].
+    """
+    since, columns = tracks.stamp - tracks.last_seen, new.nonzero()[0]
+    rows = ((tracks.ids != UNCONFIRMED) & (since > 0.0) & (since <= _LONGEST_GAP)).nonzero()[0]
+    if not len(rows):
+        return NO_PAIRS
+    mean, covariance = tracks.moments
+    traces = np.trace(covariance[:, :3, :3], axis1=1, axis2=2)
+    change = (np.linalg.norm(mean[rows, 3:6], axis=1) + spare) * since[rows]
+    distance = np.linalg.norm(mean[rows, None, :3] - mean[columns, :3], axis=2)
+    near = distance <= np.sqrt(gate * (traces[rows, None] + traces[columns])) + change[:, None]
+    lives = (1 << tracks.ages[columns]) - 1  # the updates since each new track began
+    near &= tracks.hits[rows, None] & tracks.hits[columns] & lives == 0
+    allowed = matching_labels([tracks.labels[i] for i in rows.tolist()], [tracks.labels[i] for i in columns.tolist()])
+    older, newer = (near if allowed is None else near & allowed).nonzero()
+    if not len(older):
+        return NO_PAIRS
+    found = _best(older, newer, distance[older, newer], np.zeros(len(older)), distance.shape)
+    return Pairs(rows[found.tracks], columns[found.detections], found.distances)
 
 
 def assign(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import Pose
-from imitarm.perception.association import Pairs, assigned, duplicates
+from imitarm.perception.association import Pairs, assigned, duplicates, successors
 from imitarm.perception.consistency import Consistency, chi_square_quantile
 from imitarm.perception.detection import Detection
 from imitarm.perception.motion_filter import Belief, Measurements, MotionFilter
@@ -60,6 +60,10 @@ class ObstacleTracker:
     **Late detections.** Detections may arrive out of order. If an update is at most ``history`` seconds older than the
     newest update, the tracker inserts it and repeats all updates after it. The result is therefore the same as if all
     updates had arrived in order. Older updates are ignored, and :attr:`ignored` counts them as ``"late"``.
+
+    **Sudden changes.** If an obstacle suddenly stops, starts or turns back, its detections leave the gate and begin a
+    new track. When the tracker confirms the new track, it merges the two tracks if they belong to the same obstacle
+    (:func:`~imitarm.perception.association.successors`). The merged track keeps the number of the older track.
 
     **Other imperfect input.** :attr:`ignored` also counts three other cases. A second update with the same stamp and
     the same detections is ignored (``"repeated"``). Two detections of one update are duplicates if their positions may
@@ -333,6 +337,8 @@ class ObstacleTracker:
         seen = (index >= 0).nonzero()[0]
         pairs = Pairs(seen, index[seen], memory.array("distances")[seen])
         fits = len(tracks.ids) + len(detections) <= self.max_obstacles
+        known = tracks.ids != UNCONFIRMED
+        fits &= not ((index < 0) & known).any() or not ((index >= 0) & ~known).any()  # no track has a successor
         if fits and not self.rotations and not flags & ALL_SEEN:
             return _Step(stamp, detections, self._renewed(tracks, memory, stamp, detections, rows), pairs.distances)
         return Belief(memory.array("mean"), memory.array("covariance"), np.ones((memory.n, 1))), pairs
@@ -478,10 +484,26 @@ class ObstacleTracker:
         new = (tracks.ids == UNCONFIRMED) & (np.bitwise_count(tracks.hits) >= self.confirm[0])
         if not new.any():
             return tracks
+        pairs = successors(tracks, new, self.gate, self.filter.initial_speed)
+        if len(pairs.tracks):
+            tracks = self._continued(tracks, pairs)
+            new = np.delete(new, pairs.detections)
         ids = tracks.ids.copy()
         count = int(new.sum())
         ids[new] = tracks.next_id + np.arange(count)
         return tracks.changed(ids=ids, next_id=tracks.next_id + count)
+
+    @staticmethod
+    def _continued(tracks: Tracks, pairs: Pairs) -> Tracks:
+        """Return the tracks, where each older track of ``pairs`` goes on as its successor, which is removed."""
+        older, newer = pairs.tracks, pairs.detections
+        last_seen, hits, seen = tracks.last_seen.copy(), tracks.hits.copy(), list(tracks.detections)
+        last_seen[older], hits[older] = last_seen[newer], hits[newer]
+        for i, j in zip(older.tolist(), newer.tolist(), strict=True):
+            seen[i] = seen[j]
+        belief = tracks.belief.replaced(older, tracks.belief.rows(newer))
+        merged = tracks.changed(belief=belief, last_seen=last_seen, hits=hits, detections=tuple(seen))
+        return merged.rows(np.delete(np.arange(len(tracks)), newer))
 
 
 def _checked_confirm(confirm: object) -> tuple[int, int]:
