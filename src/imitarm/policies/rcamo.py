@@ -40,6 +40,7 @@ Array = NDArray[np.float64]
 
 _SAME_PLACE = 5e-3  # [m, rad] a start nearer than this to the learned one is the learned one
 _RATE_TIME = 0.1  # [s] in which the phase takes up another speed
+_HELD, _AT_LEAST = 1.0, 0.95  # [s] for which the lag exceeds this fraction of the permitted lag: the arm cannot follow
 _STANDS = 0.1  # speed of the phase below which the motion is said to wait
 _DISPLACED = 1e-3  # [m] from the learned path: less is not called avoiding
 _FASTEST_TURN = 1.0  # [rad/s] by which an error of the tool's rotation is corrected
@@ -65,7 +66,8 @@ class RCAMO(Policy):
     motion of the tool and of the obstacles over a horizon. It takes the candidate with the least cost (thesis Eq 5.5,
     corrected; see :class:`~imitarm.policies.least_cost.LeastCost`). The candidates include waiting and moving
     backwards. If no obstacle is near, ``u`` is 0, and the spring brings the tool back to its path. If the tool lags
-    behind its commanded position, the phase slows down or stops.
+    behind its commanded position, the phase slows down or stops. If this takes more than one second, the arm may be
+    unable to reach so far to the side. Then only the lag along the path slows the phase down.
 
     The policy keeps only the tool clear of obstacles; the :class:`~imitarm.safety.SafetyFilter` keeps the links clear.
     The policy decides step by step. It does not know in advance whether the tool will reach the goal, and never raises
@@ -179,7 +181,7 @@ class RCAMO(Policy):
 
     def _begin(self, observation: Observation, phase: float) -> None:
         path = self._followed(observation)
-        self._phase, self._rate = phase, 1.0
+        self._phase, self._rate, self._held = phase, 1.0, 0.0
         self._deviation = np.zeros((2, 3))
         self._deviation[0] = observation.tool_to_base.position - path.position(phase)
         self._scaled = np.zeros(3)
@@ -235,7 +237,9 @@ class RCAMO(Policy):
             reference, lag, away = reference + shift, lag - shift, self._patience
         chosen = self._choose(observation, path, lag)
         self._scaled = chosen.scaled
-        rate = chosen.rate * max(0.0, 1.0 - (away / self._patience) ** 2)
+        self._held = self._held + dt if away > _AT_LEAST * self._patience else 0.0
+        behind = away if self._held < _HELD else max(0.0, -float(lag.dot(path.tangent(self._phase))))
+        rate = chosen.rate * max(0.0, 1.0 - (behind / self._patience) ** 2)
         phase = self._advance(rate, self.least_cost.max_push * chosen.scaled, dt)
         moved = path.position(self._phase) + self._deviation[0]
         twist = np.empty(6)
