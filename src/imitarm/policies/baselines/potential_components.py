@@ -43,7 +43,8 @@ def component_distances(
 
     The distance is ``d = sd(mu) - sqrt(n^T Sigma n) - margin``. Here, ``sd(mu)`` is the signed distance of the
     ellipse's centre ``mu``, and the square root is the extent of the ellipse towards the obstacle. The result is exact
-    for a spherical obstacle. It is a lower bound for every convex obstacle that does not contain the centre.
+    if the ellipse is a circle or a sphere. It is a lower bound for every convex obstacle that does not contain the
+    centre.
 
     Returns:
         distances (n_obstacles, n_components) [m], normals (n_obstacles, n_components, 3) and spreads
