@@ -497,12 +497,17 @@ class ObstacleTracker:
     def _continued(tracks: Tracks, pairs: Pairs) -> Tracks:
         """Return the tracks, where each older track of ``pairs`` goes on as its successor, which is removed."""
         older, newer = pairs.tracks, pairs.detections
-        last_seen, hits, seen = tracks.last_seen.copy(), tracks.hits.copy(), list(tracks.detections)
+        last_seen, hits = tracks.last_seen.copy(), tracks.hits.copy()
+        sizes, counts, seen = tracks.sizes.copy(), tracks.counts.copy(), list(tracks.detections)
         last_seen[older], hits[older] = last_seen[newer], hits[newer]
         for i, j in zip(older.tolist(), newer.tolist(), strict=True):
+            if seen[i].solid.kind != seen[j].solid.kind:  # sizes of two kinds have different meanings
+                sizes[i], counts[i] = sizes[j], counts[j]
             seen[i] = seen[j]
         belief = tracks.belief.replaced(older, tracks.belief.rows(newer))
-        merged = tracks.changed(belief=belief, last_seen=last_seen, hits=hits, detections=tuple(seen))
+        merged = tracks.changed(
+            belief=belief, last_seen=last_seen, hits=hits, sizes=sizes, counts=counts, detections=tuple(seen)
+        )
         return merged.rows(np.delete(np.arange(len(tracks)), newer))
 
 
