@@ -43,8 +43,8 @@ class CameraObserver:
     **A frozen camera.** Only an image with a later time stamp than the previous image is used. If the newest image is
     older than ``max_age``, the obstacles are no longer predicted, and the scene keeps the stamp of the newest image.
     From this stamp, a watchdog can compute the age of the scene. Before the first image arrives, the scene is empty,
-    and its stamp is the time of the first call. To keep the arm at rest until images arrive, use
-    ``Watchdog(from_start=True)``.
+    and its stamp is the time of the first call. With ``Watchdog(from_start=True)``, the arm stops if no image arrives
+    within the watchdog's ``stop_after``.
 
     **Wrong clocks.** An image from the future would hide that a camera is frozen. Therefore, ``observe(t)`` raises
     InputError if the stamp of an image is later than the call by more than ``max_age``. It also does so if the first

@@ -327,7 +327,7 @@ def quadratic_program(problem: IKProblem) -> Array:
 def _compiled(
     problem: IKProblem, jacobian: Array, target: Array, thrift: float, matrix: Array | None, least: Array | None
 ) -> Array | None:
-    """Return the minimum that compiled code finds; None without this code, or if the limits contradict each other."""
+    """Return the minimum that compiled code finds; None if it finds none, or without this code."""
     kernel = library()
     if kernel is None:
         return None

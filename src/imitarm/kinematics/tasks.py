@@ -2,7 +2,7 @@ r"""Tasks of the inverse kinematics: desired motions, as small objects that can 
 
 Let :math:`v` be the joint velocity. A task sets the target velocity :math:`t` of a quantity that moves with :math:`J
 v`, for example of the tool's pose. The solver minimises the sum of :math:`\tfrac12 |J v - t|^2` over all tasks, within
-the limits of the joints.
+all limits (of the joints and of clearances).
 """
 
 from __future__ import annotations
@@ -143,8 +143,9 @@ class ElbowTask(NamedTuple):
     and e is the target velocity of the tool's task. The elbow's speed goes to zero as the arm becomes straight. It also
     goes to zero near the wrist positions at which the stereographic angle is undefined (a half-line from the shoulder).
     From one step to the next, the speed s changes by at most half of the change that the acceleration limits of the
-    joints allow. While no joint reaches a limit, the elbow task does not move the tool. When a joint reaches a limit,
-    the weights decide between the tool's task and the elbow task.
+    joints allow. While no limit restricts the joint velocity, the elbow task does not move the tool, whatever its
+    weight. If a limit of a joint or of a clearance restricts it, the weights decide between the tool's task and the
+    elbow task.
 
     Attributes:
         angle: desired SEW angle :math:`\psi_h` [rad].

@@ -55,7 +55,7 @@ NO_PAIRS = Pairs(_NONE, _NONE, np.empty(0))
 
 
 def assigned(tracks: Tracks, detections: Sequence[Detection], measured: Measurements, gate: float) -> Pairs:
-    """Assign at most one detection to each track; confirmed tracks get their detections before the other tracks do.
+    """Assign detections to tracks, each at most once; confirmed tracks get their detections before the others do.
 
     Args:
         tracks: the tracks, predicted to the time of the detections.
@@ -93,7 +93,7 @@ def successors(tracks: Tracks, new: NDArray[np.bool_], gate: float, spare: float
     r"""Find new tracks that follow the obstacles of older tracks, after sudden changes of their velocities.
 
     An obstacle that suddenly stops, starts or turns back leaves the gate of its track, and its detections begin a new
-    track. Two tracks may belong to the same obstacle if no update contained detections of both, and if
+    track. Two tracks may belong to the same obstacle if their labels match, no update had detections of both, and
 
     .. math:: |z - p| \le \sqrt{\gamma\,\mathrm{tr}\,S} + (|v| + v_0)\,\tau
 

@@ -29,7 +29,7 @@ class DepthNoise:
         edge_dropout: probability that a pixel at a depth edge is lost. At a depth edge, the depths of two neighbouring
             pixels differ by more than 5 cm.
         dropout: probability that any other pixel is lost.
-        mixed: probability that a pixel at a depth edge measures a depth between the two surfaces.
+        mixed: probability that a pixel at a depth edge, if it is not lost, measures a depth between the two surfaces.
         step: depths are rounded to multiples of this step [m]; 0: depths are not rounded.
 
     Raises:

@@ -223,7 +223,7 @@ class Tracks:
 
     @cached_property
     def reported_rates(self) -> Array:
-        """Angular velocity of each obstacle, 0 if it is not larger than its noise, shape (n, 3) [rad/s]."""
+        """Angular velocity of each obstacle, reduced by its noise (see ``Rates``), shape (n, 3) [rad/s]."""
         return self.rates.reported
 
     @cached_property

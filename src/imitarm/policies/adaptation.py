@@ -108,7 +108,7 @@ def adapt(
             the spheres have the learned orientation of the tool.
         arm: the arm with its tool. The function then plans a joint path. On this path, every moving part of the arm
             keeps the clearance, and the links stay at least 12 mm apart. The motion is slower than learned where the
-            velocity or acceleration limits of the arm require it.
+            limits of velocity, acceleration or torque require it.
         clearance: required distance from the tool, or from the whole arm, to every obstacle [m].
         forbidden: directions in which no component may move, shape (m, 3), for example ``HORIZONTAL_ONLY`` or
             ``NOT_DOWN``.

@@ -362,7 +362,7 @@ class Gaps:
         return len(self.room)
 
     def normals(self, chosen: Index) -> Array:
-        """Return the directions in which the distances of chosen pairs grow fastest, base frame, shape (m, 3)."""
+        """Return unit vectors (base frame) along which the distances of chosen pairs grow fastest, shape (m, 3)."""
         normals = np.empty((len(chosen), 3))
         for i, pairs in enumerate(self.sources):
             of = np.flatnonzero(self.source[chosen] == i)

@@ -151,7 +151,7 @@ class ToolAmongObstacles:
         return len(self.radii) * len(self.obstacles)
 
     def centres(self, pair: int, positions: Array, samples: Index | slice = slice(None)) -> Array:
-        """Return positions of the centre of a pair's sphere, relative to the obstacle's displacement since time 0.
+        """Return positions of the centre of a pair's sphere, minus the obstacle's displacement since time 0.
 
         Args:
             pair: index of the pair of a sphere and an obstacle.

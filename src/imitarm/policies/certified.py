@@ -5,9 +5,9 @@ The algorithm of :func:`find_detour`:
 1. **Side.** Take the obstacle that violates the clearance most, and try directions across the path. The *lift* of a
    sample is how far the sample must move along a direction until it keeps the clearance. A small quadratic program
    computes the smallest displacements of the components that give all samples their lift. The cost of a direction is
-   the displacement relative to the demonstrated variance, plus the violations that remain at other obstacles. The
-   search follows the direction of least cost until no sample violates the clearance. If this direction fails, the
-   search returns to other directions.
+   the displacement relative to the demonstrated variance, plus the violations that remain. The search follows the
+   direction of least cost until no sample violates the clearance. If this direction fails, the search returns to other
+   directions.
 2. **Least detour** (:mod:`~imitarm.policies.least_detour`): the smallest displacement that keeps the clearance and
    passes each obstacle on the chosen side.
 3. **Certificate** (:mod:`~imitarm.policies.certificate`): a lower bound of the distance on the whole path, not only at

@@ -80,9 +80,10 @@ class CertifiedRCAMO(Policy):
     mean velocities over a longer time (:mod:`~imitarm.perception.steady_velocity`). If a new prediction of a tracked
     obstacle comes too close to a plan, the plan stays valid while its next 1.5 s keep the clearance.
 
-    The reason in each command names the obstacle. As soon as a plan is certified, the motion continues. As with all
-    policies, let a :class:`~imitarm.safety.SafetyFilter` check every command. If obstacles at rest make the motion
-    impossible, ``reset`` raises an error. If only a moving obstacle makes the motion impossible, the arm waits.
+    The reason in a command says why the arm brakes, waits or deviates from its path. As soon as a plan is certified,
+    the motion continues. As with all policies, let a :class:`~imitarm.safety.SafetyFilter` check every command. If
+    obstacles at rest make the motion impossible, ``reset`` raises an error. If only a moving obstacle makes the motion
+    impossible, the arm waits.
 
     In a simulation, the time stands still while ``step`` computes a plan. On a real arm, the computation takes time;
     set ``planning_time`` to this time. Each plan then begins at the end of this time, at the state that is predicted
@@ -105,7 +106,7 @@ class CertifiedRCAMO(Policy):
             [s].
         gain: feedback gain of the joint positions [1/s].
         arrival: distance from the goal below which the tool has arrived [m].
-        max_rounds: largest number of rounds of one search for a plan, which limits the computing time. The next search
+        max_rounds: largest number of rounds of one search while the arm moves, to limit computing time. The next search
             continues with the result of this one. See :func:`~imitarm.policies.replan`. None: no limit.
         patience: time without a certified plan after which RCAMO commands the arm instead of waiting [s].
         options: arguments of :class:`~imitarm.policies.Policy`; ``arm`` is required.

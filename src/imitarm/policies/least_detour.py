@@ -119,7 +119,10 @@ class AllowedDirections:
         return vectors @ self.axes @ self.axes.T
 
     def unit_directions(self, candidates: Array) -> Array:
-        """Return candidate directions (m, 3) without their forbidden components, scaled to length 1."""
+        """Return candidate directions (m, 3) without their forbidden components, scaled to length 1.
+
+        A direction is left out if its length without these components is at most 0.25.
+        """
         allowed = self.enforced(candidates @ self.axes) if len(self.forbidden) else candidates
         length = np.sqrt(np.einsum("md,md->m", allowed, allowed))
         allowed = allowed[length > 0.25] / length[length > 0.25, None]

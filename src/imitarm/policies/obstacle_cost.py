@@ -172,8 +172,8 @@ class GaussianCost(ObstacleCost):
         L &= R\,\mathrm{diag}(\ell_j^2)\,R^T, \qquad \ell_j = \tfrac12 (a_j + r + d_{safe})
 
     Here, ``a_j`` are the obstacle's semi-axes, and R is its rotation. ``r`` is the radius of a sphere of the tool, and
-    ``chi`` its centre. ``P`` is the covariance of the obstacle's predicted position ``y``. The thesis computes a mean
-    over samples (Eq 5.5, whose exponent lacks its minus sign). The formula above is the exact mean.
+    ``chi`` its centre. ``P`` is the covariance of the obstacle's predicted position :math:`\hat y`. The thesis computes
+    a mean over samples (Eq 5.5, whose exponent lacks its minus sign). The formula above is the exact mean.
 
     The height of the Gaussian is ``alpha = 2 k l^2 exp(2)``, where l is the smallest of the three lengths ``l_j``. The
     reason is as follows. At the distance 2 l from the obstacle's centre, the tool has exactly the required clearance.

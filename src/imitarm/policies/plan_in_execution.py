@@ -201,8 +201,8 @@ class PlanInExecution:
     ) -> PlanInExecution | None:
         """Return the plan with a new guarantee for the observed obstacles; None if the rest of the plan is too close.
 
-        Predictions of tracked obstacles are uncertain far ahead. If the whole rest of the plan does not keep the
-        clearance, but the next ``horizon`` seconds do, the guarantee covers only this time. Call the method again
+        Predictions of tracked obstacles are uncertain far ahead. If there are tracked obstacles, and only the next
+        ``horizon`` seconds of the plan keep the clearance, the guarantee covers only this time. Call the method again
         before the guarantee ends.
 
         Args:

@@ -46,7 +46,7 @@ class Remainder:
         tilt: planned coefficients of the tilts, shape (n_tilts, 3) [rad].
         joints: planned joint positions at the samples, shape (n, n_joints) [rad]; near the start, they are shifted so
             that the first is the measured posture.
-        rate: measured speed along the path at the start, divided by the planned speed.
+        rate: measured joint speed along the path at the start, divided by the planned joint speed at the learned times.
         begins: time in the learned motion at which the rest begins [s].
     """
 

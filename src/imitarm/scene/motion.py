@@ -74,7 +74,7 @@ class MovingScene:
 
     Attributes:
         scene: all obstacles, with their poses at the time ``scene.stamp``.
-        motions: functions of time that give the poses of some obstacles, by the obstacle's index or name.
+        motions: functions of time that give the poses or positions of some obstacles, by the obstacle's index or name.
 
     Raises:
         InputError: when an obstacle with a motion is not in the scene, or a motion does not return a pose or a

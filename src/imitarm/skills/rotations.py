@@ -215,7 +215,7 @@ class QuaternionDMP:
         Args:
             trajectory: the motion to reproduce.
             exact_ends: whether the motion must start and end exactly at the first and the last rotation. If False,
-                these rotations are smoothed like all others.
+                these rotations are smoothed too, but less than the others.
 
         Raises:
             InputError: when ``trajectory`` has no quaternions, or two neighbouring rotations are more than 90 degrees

@@ -144,7 +144,7 @@ class BaselinePolicy(PathPolicy):
         return replace(plan, only_on_schedule=self.predicts and not scene.packed.still)
 
     def reset(self, observation: Observation) -> None:
-        """Plan the path if no obstacle moves; otherwise, begin to react one control period at a time.
+        """Begin to react step by step if an obstacle moves and the method has a reaction; otherwise, plan the path.
 
         Raises:
             InfeasibleError: when the method plans a path and finds no solution; the message gives the reason.

@@ -224,8 +224,8 @@ class RRTConnect(PathPolicy):
         """Search for a clear joint path.
 
         Raises:
-            InfeasibleError: when the start posture or every goal posture is too close to an obstacle, when no path was
-                found in time, or when an obstacle moves.
+            InfeasibleError: when the start posture violates a clearance or the limit of the tilt, when no goal posture
+                keeps the clearances, when no path was found in time, or when an obstacle moves.
         """
         if any(obstacle.velocity.any() or obstacle.angular_velocity.any() for obstacle in scene.obstacles):
             raise InfeasibleError("rrt-connect plans only among obstacles that stand still: use another policy")
@@ -243,7 +243,10 @@ class RRTConnect(PathPolicy):
             around = _surroundings(arm, scene, self.clearance + allowance, learned, q)
             clear = ClearMotions(around, tilt)
             if not clear.posture(q):
-                reason = "in its start posture, the arm is too close to an obstacle: move the obstacle or the arm"
+                reason = (
+                    "in its start posture, the arm is too close to an obstacle or to itself, or the tool is tilted too "
+                    "far: move the obstacle or the arm"
+                )
                 continue
             goals = _goal_postures(around, learned.pose(len(learned) - 1), q)
             left = until - time.process_time()
