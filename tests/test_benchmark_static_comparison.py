@@ -436,7 +436,9 @@ def test_obstacles_can_be_placed_on_the_paths_of_skills_from_files(tmp_path, cap
         (["--jobs", "0"], "--jobs"),
         (["--scheduler", "tcp://127.0.0.1:1"], "--backend dask"),
         (["compare", "nowhere"], "no such folder"),
-        (["compare", ".", "--play", "S1"], "no results"),
+        (["compare", ".", "--play", "S1"], "name this page with --report"),
+        (["compare", ".", "--play", "S1", "--report", "page.html"], "write family, dimension and seed"),
+        (["compare", "."], "no results"),
     ],
 )
 def test_what_is_wrong_is_said(words, said, tmp_path, monkeypatch, capsys):

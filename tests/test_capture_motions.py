@@ -98,7 +98,7 @@ def test_axes_of_a_capture_can_be_turned(tmp_path):
 
 
 def test_a_capture_in_other_units_or_out_of_order_is_refused(tmp_path):
-    with pytest.raises(FileFormatError, match="mm"):
+    with pytest.raises(FileFormatError, match="in millimetres"):
         MotionCapture.load(exported(tmp_path, [0.0, 1.0], scale=1e-3))
     with pytest.raises(FileFormatError, match="line 5: the time"):
         MotionCapture.load(exported(tmp_path, [0.0, 1.0, 1.0]))

@@ -56,7 +56,10 @@ def test_no_command_writes_anywhere_else(command, monkeypatch):
     monkeypatch.setattr(argparse._ActionsContainer, "add_argument", noted)
     cli._parser([command])
     reads = {"--calibration", "--scene", "--points", "--config", "--data", "--tool", "--robot", "--package-path"}
-    reads |= {"--skill", "--skills"}
+    reads |= {"--skill", "--skills", "--saved"}
     files = {name for name, action in seen.items() if action.metavar in ("FILE", "FOLDER", "DIR")} - reads
-    own = {"benchmark": {"--out", "--report", "--fill", "--json", "--markdown", "--save"}, "demo": {"--out"}}
+    own = {
+        "benchmark": {"--out", "--report", "--fill", "--json", "--markdown", "--save", "--figure"},
+        "demo": {"--out"},
+    }
     assert files == set(own.get(command, WRITES.get(command, ((), ()))[1]))
