@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ik_rows import State, avoiding_mink, loop_states, obstacles, shaped
 from imitarm.command import Command
 from imitarm.control_loop import ContactDetector
+from imitarm.kinematics import ik
 from imitarm.kinematics.arm import ArmModel, ArmState
 from imitarm.kinematics.ik import IKSolver
 from imitarm.kinematics.pose import Pose
@@ -166,6 +167,33 @@ def tick_against_roboplan() -> Row:
     return Row(name, ours, lambda: peer(next(theirs).q), f"{named('roboplan')}, Oink", faster=1.0, check=check)
 
 
+def _by_daqp(tick: Callable[[], Array]) -> Callable[[], Array]:
+    """Return a control tick in which daqp solves the quadratic program, as it does without compiled code."""
+    compiled = ik._compiled
+
+    def step() -> Array:
+        ik._compiled = lambda *_: None
+        try:
+            return tick()
+        finally:
+            ik._compiled = compiled
+
+    return step
+
+
+def tick_against_daqp() -> Row:
+    """The safety filter with 5 obstacles at rest: our solver of the quadratic program, against daqp."""
+    setup = _setup()
+
+    def check() -> tuple[bool, str]:
+        ours, theirs = _tick(*setup), _by_daqp(_tick(*setup))
+        largest = max(float(np.abs(ours() - theirs()).max()) for _ in setup[3])
+        return largest < 1e-6, f"largest difference {largest:.0e} rad/s"
+
+    name = "safety filter, 5 obstacles, compiled quadratic program"
+    return Row(name, _tick(*setup), _by_daqp(_tick(*setup)), f"the same with {named('daqp')}", faster=1.2, check=check)
+
+
 def contact_detection() -> Row:
     """One update of the momentum observer."""
     arm = ArmModel.load("sawyer", tool="gripper")
@@ -188,5 +216,6 @@ ROWS: tuple[Callable[[], Row], ...] = (
     tick_against_mink,
     whole_tick_against_mink,
     tick_against_roboplan,
+    tick_against_daqp,
     contact_detection,
 )

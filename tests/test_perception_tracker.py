@@ -135,12 +135,12 @@ def test_a_track_continues_after_a_sudden_change(motion, change):
 def test_a_merged_track_has_the_shape_that_was_detected_last(motion):
     tracker = ObstacleTracker(motion)
     for time in np.arange(30) / 30.0:
-        tracker.update(time, [sphere([0.6 * time, 0.0, 0.0])])
+        tracker.update(time, [sphere([0.6 * time, 0.0, 0.0])])  # without a label
     can = Cylinder(Pose(np.array([0.53, 0.0, 0.0]), np.array([1.0, 0.0, 0.0, 0.0])), 0.03, 0.12)
     for time in 1.0 + np.arange(5) / 30.0:
-        tracks = tracker.update(time, [Detection(can, NOISE)])
+        tracks = tracker.update(time, [Detection(can, NOISE, "can")])
     (track,) = tracks
-    assert track.track_id == 0 and isinstance(track.obstacle, Cylinder)
+    assert (track.track_id, track.label) == (0, "can") and isinstance(track.obstacle, Cylinder)
     (seen,) = tracker.scene(1.2).obstacles
     np.testing.assert_allclose([seen.radius, seen.length], [0.03, 0.12])
 

@@ -56,7 +56,13 @@ def _tool_tables(results: MovingResults) -> list[Table]:
     found = [success_table(results), family_table(results), quality_table(results)]
     found += [rmse_table(results, FEW, "Fig 5.7 of the thesis: RMSE with one moving obstacle")]
     found += [rmse_table(results, MANY, "Fig 5.11 of the thesis: RMSE with several moving obstacles")]
-    found += [claims_table(results), paired_table(results), sensor_table(results), tracking_table(results)]
+    found += [
+        claims_table(results),
+        paired_table(results),
+        causal_table(results),
+        sensor_table(results),
+        tracking_table(results),
+    ]
     return [*found, causes_table(results), contacts_table(results)]
 
 
@@ -233,6 +239,20 @@ def paired_table(results: MovingResults) -> Table:
         "test of the RMSE. Holm's method corrects both for the number of methods."
     )
     return Table(f"{ours} and each other method in the same scenes", columns, tuple(rows), note)
+
+
+def causal_table(results: MovingResults) -> Table:
+    """Return a table that compares our most successful method with the causal oracle in the same scenes, by family."""
+    ours = next((row for row in results.rows if row in OURS), None)
+    if ours is None or _CAUSAL not in results.rows:
+        return Table("Causal oracle", (), ())
+    rows = []
+    for family in results.families():
+        scenes, first, second, both = _paired(results, ours, _CAUSAL, [family])
+        if scenes:
+            rows.append((family, str(scenes), str(len(both) + first), str(len(both) + second)))
+    columns = ("family", "scenes>", f"{ours} succeeds>", f"{_CAUSAL} succeeds>")
+    return Table(f"{ours} and the causal oracle in the same scenes", columns, tuple(rows))
 
 
 def _p(value: float) -> str:

@@ -232,6 +232,32 @@ def _best(tracks: Indices, detections: Indices, distance: Array, log: Array, sha
     return Pairs(rows, columns, squared[rows, columns])
 
 
+def distinct(detections: Sequence[Detection], measured: Measurements, gate: float) -> Indices:
+    """Return the indices of the detections that remain if each obstacle counts once, shape (k,).
+
+    Two detections are of one obstacle if their positions may be equal and each position is inside the other shape. The
+    more accurate detection remains.
+
+    Args:
+        detections: the detections of one update.
+        measured: the detections as measurements.
+        gate: see :func:`duplicates`.
+    """
+    dropped: set[int] = set()
+    for i, j in duplicates(measured, gate):
+        first, second = detections[i], detections[j]
+        inside = first.obstacle.signed_distance(second.position) < 0.0
+        if not inside or second.obstacle.signed_distance(first.position) >= 0.0 or dropped & {i, j}:
+            continue
+        dropped.add(i if _accuracy(first) > _accuracy(second) else j)
+    return np.array([i for i in range(len(detections)) if i not in dropped], dtype=np.intp)
+
+
+def _accuracy(detection: Detection) -> tuple[float, ...]:
+    """Return a key by which detections are sorted, the most accurate first, whatever their order was."""
+    return (float(np.trace(detection.covariance)), *detection.position.tolist())
+
+
 def duplicates(measured: Measurements, gate: float) -> list[tuple[int, int]]:
     """Return the pairs ``(i, j)``, ``i < j``, of measurements whose positions may be equal.
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -84,30 +83,6 @@ def moving_capsule(starts: Array, ends: Array, radius: float, name: str, times: 
     half = 0.5 * float(length.mean()) * unit[0]
     capsule = Capsule(middle[0] - half, middle[0] + half, radius, name=name)
     return capsule, Track(times, middle, _rotations(unit))
-
-
-def there_and_back(skeletons: Sequence[Skeleton]) -> Iterator[Skeleton]:
-    """Yield a recording forwards, backwards, forwards, and so on without end; the times begin with 0.
-
-    The person's motion has therefore no jump, even if a robot's motion takes longer than the recording.
-
-    Args:
-        skeletons: at least two skeletons with increasing times.
-
-    Raises:
-        InputError: when there are fewer than two skeletons, or their times do not increase.
-    """
-    times = np.array([skeleton.time for skeleton in skeletons])
-    if len(times) < _FEWEST or (np.diff(times) <= 0.0).any():
-        raise InputError(f"there_and_back: at least 2 skeletons with increasing times are needed, got {len(times)}")
-    yield replace(skeletons[0], time=0.0)
-    begin, forwards = 0.0, True
-    while True:
-        order = range(1, len(times)) if forwards else range(len(times) - 2, -1, -1)
-        origin = times[0] if forwards else times[-1]
-        for i in order:
-            yield replace(skeletons[i], time=float(begin + abs(times[i] - origin)))
-        begin, forwards = begin + float(times[-1] - times[0]), not forwards
 
 
 def _smoothed(times: Array, starts: Array, ends: Array, smoothing: float) -> tuple[Array, Array, Array]:

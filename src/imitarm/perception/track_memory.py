@@ -124,7 +124,7 @@ def renewed(
 ) -> TrackMemory:
     """Take over what the detections of an update say, end and begin tracks, and confirm tracks.
 
-    The compiled code computes the same as the methods ``_seen``, ``_pruned``, ``_born`` and ``_confirmed`` of
+    The compiled code computes the same as ``Tracks.born`` and the methods ``_seen``, ``_pruned`` and ``_confirmed`` of
     ``ObstacleTracker``.
 
     Args:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from imitarm.errors import InputError
 from imitarm.kinematics.pose import Pose
-from imitarm.perception.association import Pairs, assigned, duplicates, successors
+from imitarm.perception.association import Pairs, assigned, distinct, successors
 from imitarm.perception.consistency import Consistency, chi_square_quantile
 from imitarm.perception.detection import Detection
 from imitarm.perception.motion_filter import Belief, Measurements, MotionFilter
@@ -286,8 +286,9 @@ class ObstacleTracker:
         measured = self._measurements(detections, table)
         if known is None:
             tracks = tracks.at(stamp)
-            apart = self._merged(detections, measured)
-            if apart is not None:
+            apart = distinct(detections, measured, self.gate)
+            if len(apart) < len(detections):
+                self.ignored["duplicate"] += len(detections) - len(apart)
                 detections, table = tuple([detections[i] for i in apart.tolist()]), table[apart]
                 measured = measured.rows(apart)
             pairs = assigned(tracks, detections, measured, self.gate)
@@ -300,7 +301,7 @@ class ObstacleTracker:
             free = np.ones(len(detections), dtype=bool)
             free[pairs.detections] = False
             left = free.nonzero()[0]
-            born = self._born(stamp, [detections[i] for i in left.tolist()], measured.rows(left))
+            born = Tracks.born(self.filter, stamp, [detections[i] for i in left.tolist()], measured.rows(left))
             tracks = self._fitted(tracks.joined(born))
         return _Step(stamp, given, self._confirmed(tracks), pairs.distances)
 
@@ -369,20 +370,6 @@ class ObstacleTracker:
         origins = np.array([np.zeros(3) if c is None else c.position for c in cameras])
         return Measurements(positions, noise, rotations, origins)
 
-    def _merged(self, detections: tuple[Detection, ...], measured: Measurements) -> Indices | None:
-        """Return the detections that remain when one obstacle was detected twice; None: all."""
-        dropped: set[int] = set()
-        for i, j in duplicates(measured, self.gate):
-            first, second = detections[i], detections[j]
-            inside = first.obstacle.signed_distance(second.position) < 0.0
-            if not inside or second.obstacle.signed_distance(first.position) >= 0.0 or dropped & {i, j}:
-                continue
-            dropped.add(i if _accuracy(first) > _accuracy(second) else j)
-        if not dropped:
-            return None
-        self.ignored["duplicate"] += len(dropped)
-        return np.array([i for i in range(len(detections)) if i not in dropped])
-
     def _corrected(self, belief: Belief, pairs: Pairs, measured: Measurements) -> Belief:
         """Return the beliefs after the assigned measurements."""
         rows = pairs.tracks
@@ -449,25 +436,6 @@ class ObstacleTracker:
         alive &= (tracks.ids != UNCONFIRMED) | (tracks.ages < window) | ~missed
         return tracks if alive.all() else tracks.rows(alive.nonzero()[0])
 
-    def _born(self, stamp: float, detections: list[Detection], measured: Measurements) -> Tracks:
-        """Return new tracks, one for each detection."""
-        k = len(detections)
-        ones = np.ones(k, dtype=np.int64)
-        return Tracks(
-            self.filter,
-            stamp,
-            self.filter.born(measured.positions, measured.noise),
-            ids=np.full(k, UNCONFIRMED, dtype=np.int64),
-            last_seen=np.full(k, stamp),
-            hits=ones,
-            ages=ones,
-            sizes=np.array([d.solid.size for d in detections], dtype=float).reshape(k, 3),
-            counts=ones,
-            rates=Rates.none(k),
-            detections=tuple(detections),
-            labels=tuple(d.label for d in detections),
-        )
-
     def _fitted(self, tracks: Tracks) -> Tracks:
         """Return at most ``max_obstacles`` tracks; those that were not seen for longest are left out."""
         surplus = len(tracks) - self.max_obstacles
@@ -486,29 +454,12 @@ class ObstacleTracker:
             return tracks
         pairs = successors(tracks, new, self.gate, self.filter.initial_speed)
         if len(pairs.tracks):
-            tracks = self._continued(tracks, pairs)
+            tracks = tracks.continued(pairs.tracks, pairs.detections)
             new = np.delete(new, pairs.detections)
         ids = tracks.ids.copy()
         count = int(new.sum())
         ids[new] = tracks.next_id + np.arange(count)
         return tracks.changed(ids=ids, next_id=tracks.next_id + count)
-
-    @staticmethod
-    def _continued(tracks: Tracks, pairs: Pairs) -> Tracks:
-        """Return the tracks, where each older track of ``pairs`` goes on as its successor, which is removed."""
-        older, newer = pairs.tracks, pairs.detections
-        last_seen, hits = tracks.last_seen.copy(), tracks.hits.copy()
-        sizes, counts, seen = tracks.sizes.copy(), tracks.counts.copy(), list(tracks.detections)
-        last_seen[older], hits[older] = last_seen[newer], hits[newer]
-        for i, j in zip(older.tolist(), newer.tolist(), strict=True):
-            if seen[i].solid.kind != seen[j].solid.kind:  # sizes of two kinds have different meanings
-                sizes[i], counts[i] = sizes[j], counts[j]
-            seen[i] = seen[j]
-        belief = tracks.belief.replaced(older, tracks.belief.rows(newer))
-        merged = tracks.changed(
-            belief=belief, last_seen=last_seen, hits=hits, sizes=sizes, counts=counts, detections=tuple(seen)
-        )
-        return merged.rows(np.delete(np.arange(len(tracks)), newer))
 
 
 def _checked_confirm(confirm: object) -> tuple[int, int]:
@@ -516,8 +467,3 @@ def _checked_confirm(confirm: object) -> tuple[int, int]:
         raise InputError(f"ObstacleTracker: confirm must be two numbers (hits, updates), got {confirm!r}")
     updates = whole_number(confirm[1], "ObstacleTracker: updates of confirm", at_least=1, at_most=32)
     return whole_number(confirm[0], "ObstacleTracker: hits of confirm", at_least=1, at_most=updates), updates
-
-
-def _accuracy(detection: Detection) -> tuple[float, ...]:
-    """Return a key by which detections are sorted, the most accurate first, whatever their order was."""
-    return (float(np.trace(detection.covariance)), *detection.position.tolist())

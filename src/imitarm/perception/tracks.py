@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from imitarm.html_table import html_table
 from imitarm.perception.detection import Detection, estimated
-from imitarm.perception.motion_filter import Belief, MotionFilter
+from imitarm.perception.motion_filter import Belief, Measurements, MotionFilter
 from imitarm.perception.rotation_rate import Rates, turned_on
 from imitarm.perception.track_memory import TrackMemory
 from imitarm.scene import Obstacle
@@ -158,6 +159,28 @@ class Tracks:
     def __len__(self) -> int:
         return len(self.ids)
 
+    @classmethod
+    def born(
+        cls, motion_filter: MotionFilter, stamp: float, detections: Sequence[Detection], measured: Measurements
+    ) -> Tracks:
+        """Return new tracks, one for each detection; ``measured`` are the detections as measurements."""
+        k = len(detections)
+        ones = np.ones(k, dtype=np.int64)
+        return cls(
+            motion_filter,
+            stamp,
+            motion_filter.born(measured.positions, measured.noise),
+            ids=np.full(k, UNCONFIRMED, dtype=np.int64),
+            last_seen=np.full(k, stamp),
+            hits=ones,
+            ages=ones,
+            sizes=np.array([d.solid.size for d in detections], dtype=float).reshape(k, 3),
+            counts=ones,
+            rates=Rates.none(k),
+            detections=tuple(detections),
+            labels=tuple(d.label for d in detections),
+        )
+
     @property
     def confirmed(self) -> Indices:
         """Indices of the confirmed tracks, shape (k,)."""
@@ -178,6 +201,26 @@ class Tracks:
             detections=tuple(self.detections[i] for i in chosen),
             labels=tuple(self.labels[i] for i in chosen),
         )
+
+    def continued(self, older: Indices, newer: Indices) -> Tracks:
+        """Return the tracks, where each track in ``older`` goes on as its successor in ``newer``, which is removed."""
+        last_seen, hits, sizes, counts = (a.copy() for a in (self.last_seen, self.hits, self.sizes, self.counts))
+        last_seen[older], hits[older] = self.last_seen[newer], self.hits[newer]
+        seen, labels = list(self.detections), list(self.labels)
+        for i, j in zip(older.tolist(), newer.tolist(), strict=True):
+            if seen[i].solid.kind != seen[j].solid.kind:  # sizes of two kinds have different meanings
+                sizes[i], counts[i] = sizes[j], counts[j]
+            seen[i], labels[i] = seen[j], labels[j] or labels[i]
+        merged = self.changed(
+            belief=self.belief.replaced(older, self.belief.rows(newer)),
+            last_seen=last_seen,
+            hits=hits,
+            sizes=sizes,
+            counts=counts,
+            detections=tuple(seen),
+            labels=tuple(labels),
+        )
+        return merged.rows(np.delete(np.arange(len(self)), newer))
 
     def joined(self, other: Tracks) -> Tracks:
         """Return these tracks, followed by the tracks of ``other``, which must have the same stamp."""
