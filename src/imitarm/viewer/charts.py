@@ -61,10 +61,10 @@ def clearance(times: ArrayLike, distances: ArrayLike, required: float, *, name: 
         axes.set_ylim(min(0.0, 1.15 * d[least]), min(1.08 * d.max(), 2.0 * top) if d.max() > 0.0 else top)
         axes.annotate(
             f"required: {MM * required:.0f} mm",
-            (t[-1], MM * required),
-            xytext=(0, 3),
+            (t[0] if right else t[-1], MM * required),  # on the side without the other label
+            xytext=(3 if right else 0, 3),
             textcoords="offset points",
-            ha="right",
+            ha="left" if right else "right",
         )
         axes.set_xlim(t[0], t[-1])
         axes.set_xlabel("time [s]")

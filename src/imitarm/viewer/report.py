@@ -127,31 +127,27 @@ def report_html(report: Report) -> str:
 
 
 def _header(report: Report) -> Header:
-    """Return title, verdict and the four most important numbers."""
+    """Return title, verdict and the most important numbers; numbers that no scene has are left out."""
     obstructed = [scene for scene in report.scenes if scene.scene.obstacles]
     clear = sum(scene.rollout is not None and not scene.contact for scene in obstructed)
     required = min((scene.required_clearance for scene in obstructed), default=math.nan)
     unmoved = [scene.unmoved_fraction for scene in obstructed if not math.isnan(scene.unmoved_fraction)]
     planning = [scene.adaptation.compute_time for scene in obstructed if scene.adaptation is not None]
-    tiles = (
+    tiles = [
         Tile(str(clear), f"of {len(obstructed)}", "scenes with obstacles were free of contact"),
         Tile(
             number(MM * report.min_clearance),
             "mm",
             f"smallest measured clearance (required: {number(MM * required, 0, 'mm')})",
         ),
-        Tile(
-            number(100 * float(np.mean(unmoved)) if unmoved else math.nan, 0),
-            "%",
-            "of the components of the learned motion were not moved",
-        ),
-        Tile(
-            number(MM * float(np.median(planning)) if planning else math.nan),
-            "ms",
-            "computing time to plan the path around the obstacles (median)",
-        ),
-    )
-    return Header(report.title, report.verdict, report.passed, report.summary, tiles if obstructed else ())
+    ]
+    if unmoved:
+        share = number(100 * float(np.mean(unmoved)), 0)
+        tiles.append(Tile(share, "%", "of the components of the learned motion were not moved"))
+    if planning:
+        median = number(MM * float(np.median(planning)))
+        tiles.append(Tile(median, "ms", "computing time to plan the path around the obstacles (median)"))
+    return Header(report.title, report.verdict, report.passed, report.summary, tuple(tiles) if obstructed else ())
 
 
 def _cells(scene: SceneResult) -> Iterator[str]:
